@@ -57,8 +57,8 @@ class RayObservations:
 
     def sizes(self, camera: Intrinsics, T_cam_world: Array) -> Array:
         """Distances ``(N,)`` from the rays in standard deviations; infinite behind the camera."""
-        at = _Linearised.of(self, camera, T_cam_world)
-        return np.where(at.used, np.hypot(at.residual[0], at.residual[1]), np.inf)
+        at = _AtPose.of(self, camera, T_cam_world)
+        return np.where(at.used, at.size(), np.inf)
 
     def normal_equations(
         self, camera: Intrinsics, T_cam_world: Array, tolerance: float, far: float | None
@@ -71,66 +71,80 @@ class RayObservations:
             tolerance: By what the Huber threshold is multiplied.
             far: Gates from which on an observation is left out; None to leave out none.
         """
-        at = _Linearised.of(self, camera, T_cam_world)
-        size = np.hypot(at.residual[0], at.residual[1])
+        at = _AtPose.of(self, camera, T_cam_world)
+        size, J = at.size(), at.jacobian()
         w = at.used * np.minimum(1.0, tolerance * HUBER_K / np.maximum(size, 1e-9))
         if far is not None:
-            w = w * (size < far * self.gate)
-        weighted, rows = (at.J * w).reshape(6, -1), at.J.reshape(6, -1)
+            w *= size < far * self.gate
+        weighted, rows = (J * w).reshape(6, -1), J.reshape(6, -1)
         return weighted @ rows.T, weighted @ at.residual.ravel()
 
 
 @dataclass(frozen=True)
-class _Linearised:
-    """Residuals at a pose and their derivatives.
+class _AtPose:
+    """Rays as a camera sees them.
 
     Attributes:
         residual: ``(2, N)`` across the line, and along it beyond the ends of the ray, in standard deviations.
-        J: ``(6, 2, N)`` derivatives of the projection by a twist, rotation before translation.
         used: ``(N,)`` bool, which are in front of the camera.
+        axes: ``(2, 2, N)`` by how much a projection at unit depth (first index) moves each residual. Along
+            the line it is zero on the ray, where the depth follows.
+        xyz: ``(3, N)`` the points, camera frame, divided by their inverse depth and by ``z``.
+        inverse_depth: ``(N,)`` in the other camera.
+        z: ``(N,)`` depth of the ray's direction in this camera.
     """
 
     residual: Array
-    J: Array
     used: NDArray[np.bool_]
+    axes: Array
+    xyz: Array
+    inverse_depth: Array
+    z: Array
 
     @classmethod
-    def of(cls, rays: RayObservations, camera: Intrinsics, T_cam_world: Array) -> "_Linearised":
-        """Linearise at a pose."""
+    def of(cls, rays: RayObservations, camera: Intrinsics, T_cam_world: Array) -> "_AtPose":
+        """Give each point the depth that explains its observation best."""
         R, t = T_cam_world[:3, :3], T_cam_world[:3, 3:]
         infinity, origin = R @ rays.direction, R @ rays.origin + t
         used = infinity[2] > _MIN_DEPTH_RATIO
         z = np.where(used, infinity[2], 1.0)
-        infinity, origin = infinity / z, origin / z
+        infinity /= z
+        origin /= z
         focal_px = np.array([[camera.fx], [camera.fy]])
         # How the projection moves as the point comes nearer, and how far on that way the observation is.
         way = focal_px * (origin[:2] - infinity[:2] * origin[2])
-        length = np.sqrt((way * way).sum(axis=0))
+        length = np.hypot(way[0], way[1])
         # A camera that has only turned sees no line but a point: any direction will do.
         way = np.where(length > _NO_WAY_PX, way / np.maximum(length, _NO_WAY_PX), [[1.0], [0.0]])
-        offset = rays.observed - focal_px * infinity[:2]
-        along = (offset * way).sum(axis=0)
-        across = offset[1] * way[0] - offset[0] * way[1]
+        x, y = rays.observed - focal_px * infinity[:2]
+        along, across = x * way[0] + y * way[1], y * way[0] - x * way[1]
         at_end = 1.0 + rays.nearest * origin[2]
-        end = np.where(
-            at_end > _MIN_DEPTH_RATIO,
-            rays.nearest * length / np.maximum(at_end, _MIN_DEPTH_RATIO),
-            np.inf,
-        )
-        on_ray = np.clip(along, 0.0, end)
+        end = rays.nearest * length / np.maximum(at_end, _MIN_DEPTH_RATIO)
+        on_ray = np.minimum(np.maximum(along, 0.0), np.where(at_end > _MIN_DEPTH_RATIO, end, np.inf))
         beyond = along - on_ray
         inverse_depth = on_ray / np.maximum(length - on_ray * origin[2], 1e-12)
         per_sigma = 1.0 / np.sqrt(_variances(rays.covariance, way))
-        # ``axes[j, i]`` is what a pixel of coordinate j counts for residual i; on the ray, ``along`` is free.
-        across_axis, along_axis = np.stack([-way[1], way[0]]), way * (beyond != 0.0)
-        axes = np.stack([across_axis, along_axis], axis=1) * per_sigma * focal_px[:, None]
-        _, J = project_with_jacobian(infinity + inverse_depth * origin, axes)
-        J[3:] *= inverse_depth / z
-        return cls(np.stack([across, beyond]) * per_sigma * used, J, used)
+        axes = np.empty((2, 2, len(rays)))
+        axes[0, 0], axes[1, 0] = -way[1], way[0]
+        axes[:, 1] = way * (beyond != 0.0)
+        axes *= per_sigma * focal_px[:, None]
+        residual = np.stack([across, beyond]) * (per_sigma * used)
+        return cls(residual, used, axes, infinity + inverse_depth * origin, inverse_depth, z)
+
+    def size(self) -> Array:
+        """Distances ``(N,)`` in standard deviations."""
+        return np.hypot(self.residual[0], self.residual[1])
+
+    def jacobian(self) -> Array:
+        """Derivatives of the projection by a twist, ``(6, 2, N)``, rotation before translation."""
+        _, J = project_with_jacobian(self.xyz, self.axes)
+        J[3:] *= self.inverse_depth / self.z
+        return J
 
 
 def _variances(covariance: Array, way: Array) -> Array:
     """Variances ``(2, N)`` across unit vectors ``(2, N)`` and along them."""
     xx, xy, yy = covariance
-    x2, y2, both = way[0] ** 2, way[1] ** 2, 2.0 * xy * way[0] * way[1]
-    return np.stack([xx * y2 - both + yy * x2, xx * x2 + both + yy * y2])
+    square, both = way * way, 2.0 * xy * way[0] * way[1]
+    along = xx * square[0] + yy * square[1] + both
+    return np.stack([xx + yy - along, along])

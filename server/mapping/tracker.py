@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -176,23 +177,26 @@ def track_pose(
     best = _pose_from_landmarks(camera, marks, T_world_guess, seed, is_after_gap=is_after_gap)
     enough = max(MIN_INLIERS, min_share * len(marks.xyz))
     if best is not None and best.num_inliers >= enough and np.isfinite(best.T_cam_world).all():
+        is_in_doubt = _turn_is_in_doubt(best, camera)
+        kept = enough if is_in_doubt else max(enough, _MIN_KEPT_SHARE * best.num_inliers)
         starts = [best.T_cam_world]
-        if T_world_guess is not None and _turn_is_in_doubt(best, camera):
+        if T_world_guess is not None and is_in_doubt:
             starts.append(invert_transform(T_world_guess))
         # Near landmarks at one depth can't tell a turn from a way. Keyframes that followed them refute the
         # far view, which can: so all tracks are asked first, and landmarks tell whether they may be right.
         for with_refuted in (True, False) if much_is_refuted(world, submap) else (False,):
             rays = rays_of(camera, world, noise, others, submap, with_refuted=with_refuted)
-            kept = max(enough, _MIN_KEPT_SHARE * best.num_inliers)
-            found = [_with_rays(camera, marks, rays, start, _STEADY, kept) for start in starts]
+            steady = partial(_with_rays, camera, marks, rays, needed=_STEADY, min_inliers=kept)
+            found = [steady(start, is_rough=is_in_doubt) for start in starts]
             steadied = [p for p in found if p is not None and _is_borne_out(p, best, marks, rays, camera)]
             if steadied:
-                best = min(steadied, key=lambda p: _cost(p, marks, rays, camera))
+                cost = partial(_cost, marks=marks, rays=rays, camera=camera)
+                best = steadied[0] if len(steadied) == 1 else min(steadied, key=cost)
                 break
     elif may_carry and T_world_guess is not None and len(marks.xyz) < _RUN_OUT:
         rays = rays_of(camera, world, noise, others, submap)
         left = max(_MIN_LEFT, min_share * len(marks.xyz))
-        best = _with_rays(camera, marks, rays, invert_transform(T_world_guess), _CARRY, left)
+        best = _with_rays(camera, marks, rays, invert_transform(T_world_guess), _CARRY, left, is_rough=True)
     else:
         best = None
     if best is None:
@@ -253,6 +257,8 @@ def _with_rays(
     T_cam_world: Array,
     needed: tuple[int, float],
     min_inliers: float,
+    *,
+    is_rough: bool,
 ) -> PoseEstimate | None:
     """Refine a pose with what the tracks without a landmark say too.
 
@@ -263,6 +269,7 @@ def _with_rays(
         T_cam_world: Where to begin.
         needed: Number of rays that must agree, and the share of all rays.
         min_inliers: Landmarks that must agree.
+        is_rough: The beginning is.
 
     Returns:
         The pose with the landmarks it agrees with; None where too few agree.
@@ -270,7 +277,16 @@ def _with_rays(
     if rays is None or len(rays) < needed[0]:
         return None
     observed = (marks.xyz, marks.tracks.xy, marks.sigma_px, marks.gate_px)
-    pose = refine_pose(camera, T_cam_world, *observed, rays=rays, edge=marks.tracks.edge)
+    iterations = 10 if is_rough else 4
+    pose = refine_pose(
+        camera,
+        T_cam_world,
+        *observed,
+        iterations=iterations,
+        rays=rays,
+        edge=marks.tracks.edge,
+        is_rough=is_rough,
+    )
     num_agreeing = int((rays.sizes(camera, pose.T_cam_world) < rays.gate).sum())
     if pose.num_inliers < min_inliers or num_agreeing < max(needed[0], needed[1] * len(rays)):
         return None
