@@ -133,7 +133,7 @@ class _AtPose:
 
     def size(self) -> Array:
         """Distances ``(N,)`` in standard deviations."""
-        return np.hypot(self.residual[0], self.residual[1])
+        return np.asarray(np.hypot(self.residual[0], self.residual[1]))
 
     def jacobian(self) -> Array:
         """Derivatives of the projection by a twist, ``(6, 2, N)``, rotation before translation."""
