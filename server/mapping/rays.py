@@ -8,6 +8,8 @@ point at rest explains where they were seen. Where keyframes have turned wrongly
 the far view as well.
 """
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import islice
 
 import numpy as np
@@ -71,27 +73,46 @@ def rays_of(
         depth = own if np.isfinite(own) else depth
         if not np.isfinite(depth):
             break
-        parts.append(_on_rays_from(keyframe, row[new], depth, camera, noise, seen[new]))
+        parts.append(_Part(keyframe, row[new], new, depth))
         found[new] = True
         if (found | refuted).all():
             break
-    return RayObservations.joined(parts) if parts else None
+    return _on_rays(parts, camera, noise, seen) if parts else None
 
 
-def _on_rays_from(
-    keyframe: Keyframe, row: NDArray[np.intp], depth: float, camera: Intrinsics, noise: NoiseModel, seen: Seen
-) -> RayObservations:
-    """What is seen of tracks that are in these rows of a keyframe, whose scene has a usual depth."""
-    T = keyframe.T_world_cam
-    sigma_px, sigma_then_px = noise.sigma_px(seen.confidence), noise.sigma_px(keyframe.confidence[row])
-    shape, shape_then = shape_of(seen.edge), shape_of(keyframe.edge[row])
+@dataclass(frozen=True)
+class _Part:
+    """Tracks that a keyframe saw as the newest one.
+
+    Attributes:
+        keyframe: It.
+        row: ``(N,)`` rows of the tracks in it.
+        row_now: ``(N,)`` and in what is seen now.
+        depth: The usual one of its scene.
+    """
+
+    keyframe: Keyframe
+    row: NDArray[np.intp]
+    row_now: NDArray[np.intp]
+    depth: float
+
+
+def _on_rays(parts: Sequence[_Part], camera: Intrinsics, noise: NoiseModel, seen: Seen) -> RayObservations:
+    """Put what is seen on the rays of its keyframes: computed for all at once, as each frame needs it."""
+    counts = [len(part.row) for part in parts]
+    now = seen[np.concatenate([part.row_now for part in parts])]
+    then = np.concatenate([part.keyframe.confidence[part.row] for part in parts])
+    edge_then = np.concatenate([part.keyframe.edge[part.row] for part in parts])
+    rays = [p.keyframe.T_world_cam[:3, :3] @ camera.unproject(p.keyframe.xy[p.row]).T for p in parts]
+    sigma_px, sigma_then_px = noise.sigma_px(now.confidence), noise.sigma_px(then)
+    shape, shape_then = shape_of(now.edge), shape_of(edge_then)
     covariance = sigma_px[:, None, None] ** 2 * shape + sigma_then_px[:, None, None] ** 2 * shape_then
-    gate_px, gate_then_px = noise.threshold_px(seen.confidence), noise.threshold_px(keyframe.confidence[row])
+    gate_px, gate_then_px = noise.threshold_px(now.confidence), noise.threshold_px(then)
     return RayObservations(
-        origin=np.repeat(T[:3, 3:], len(row), axis=1),
-        direction=T[:3, :3] @ camera.unproject(keyframe.xy[row]).T,
-        nearest=np.full(len(row), 1.0 / (_MIN_DEPTH_SHARE * depth)),
-        observed=(seen.xy - (camera.cx, camera.cy)).T,
+        origin=np.repeat([part.keyframe.T_world_cam[:3, 3] for part in parts], counts, axis=0).T.copy(),
+        direction=np.concatenate(rays, axis=1),
+        nearest=np.repeat([1.0 / (_MIN_DEPTH_SHARE * part.depth) for part in parts], counts),
+        observed=(now.xy - (camera.cx, camera.cy)).T.copy(),
         covariance=np.stack([covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]]),
         gate=np.minimum(gate_px / sigma_px, gate_then_px / sigma_then_px),
     )

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from semcast.common.geometry import invert_transform
 from semcast.server.geometry.projection import depths_in
-from semcast.server.mapping.track_ids import shared_rows
+from semcast.server.mapping.track_ids import rows_among
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 Array = NDArray[np.float64]
@@ -19,7 +19,8 @@ def median_depth(world: WorldMap, keyframe: Keyframe) -> float:
 
 def median_depth_of(keyframe: Keyframe, ids: Ids, xyz: Array) -> float:
     """Return the same for points ``ids (P,)``, ascending, at ``xyz (P, 3)``."""
-    row, _ = shared_rows(ids, keyframe.ids)
+    row = rows_among(keyframe.ids, ids)
+    row = row[row >= 0]
     if len(row) == 0:
         return float("inf")
     depth = depths_in(invert_transform(keyframe.T_world_cam), xyz[row])
