@@ -8,8 +8,7 @@ that explains its observation best, anew at each pose, and derivatives are those
 uncertain, would hold the pose to it: it turns as the camera moves, most for points near the keyframe.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +21,7 @@ Array = NDArray[np.float64]
 
 #: Part of the depth in the other camera that a point must have in this one.
 _MIN_DEPTH_RATIO = 0.05
-#: Pixels per inverse depth below which a camera has not moved.
+#: Pixels per inverse depth below which a point stays where it is in the image, however near it is.
 _NO_WAY_PX = 1e-9
 
 
@@ -48,12 +47,6 @@ class RayObservations:
 
     def __len__(self) -> int:
         return len(self.gate)
-
-    @classmethod
-    def joined(cls, parts: Sequence["RayObservations"]) -> "RayObservations":
-        """Put the observations of several together."""
-        names = (field.name for field in fields(cls))
-        return cls(**{name: np.concatenate([getattr(p, name) for p in parts], axis=-1) for name in names})
 
     def sizes(self, camera: Intrinsics, T_cam_world: Array) -> Array:
         """Distances ``(N,)`` from the rays in standard deviations; infinite behind the camera."""
@@ -110,17 +103,21 @@ class _AtPose:
         z = np.where(used, infinity[2], 1.0)
         infinity /= z
         origin /= z
+        infinity[2] = 1.0  # for those that are not used as well: their derivatives are to be finite
         focal_px = np.array([[camera.fx], [camera.fy]])
         # How the projection moves as the point comes nearer, and how far on that way the observation is.
         way = focal_px * (origin[:2] - infinity[:2] * origin[2])
         length = np.hypot(way[0], way[1])
-        # A camera that has only turned sees no line but a point: any direction will do.
-        way = np.where(length > _NO_WAY_PX, way / np.maximum(length, _NO_WAY_PX), [[1.0], [0.0]])
+        has_way = length > _NO_WAY_PX
+        # A camera that has only turned, or went straight ahead on the ray, sees no line but a point: any
+        # direction will do.
+        way = np.where(has_way, way / np.maximum(length, _NO_WAY_PX), [[1.0], [0.0]])
         x, y = rays.observed - focal_px * infinity[:2]
         along, across = x * way[0] + y * way[1], y * way[0] - x * way[1]
         at_end = 1.0 + rays.nearest * origin[2]
         end = rays.nearest * length / np.maximum(at_end, _MIN_DEPTH_RATIO)
-        on_ray = np.minimum(np.maximum(along, 0.0), np.where(at_end > _MIN_DEPTH_RATIO, end, np.inf))
+        is_endless = has_way & (at_end <= _MIN_DEPTH_RATIO)
+        on_ray = np.minimum(np.maximum(along, 0.0), np.where(is_endless, np.inf, end))
         beyond = along - on_ray
         inverse_depth = on_ray / np.maximum(length - on_ray * origin[2], 1e-12)
         per_sigma = 1.0 / np.sqrt(_variances(rays.covariance, way))

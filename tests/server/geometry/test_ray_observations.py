@@ -93,6 +93,21 @@ def test_points_behind_the_camera_are_off_by_anything():
     assert not gradient.any()
 
 
+@pytest.mark.parametrize(
+    ("ray", "T_cam_origin", "distance"),
+    [
+        ((0.0, 0.0, 1.0), make_transform(np.eye(3), np.array([0.0, 0.0, -1.5])), 5.0),
+        ((1.0, 0.0, 0.0), np.eye(4), np.inf),
+    ],
+    ids=["where the camera goes, past its nearest point", "along the plane of the camera"],
+)
+def test_rays_that_are_a_point_or_nowhere_have_finite_derivatives(ray, T_cam_origin, distance):
+    rays = on_rays(np.eye(4), np.array([[0.0, 0.0, 1.0]]), np.array([[325.0, 240.0]]))
+    rays.direction[:, 0] = ray
+    assert np.allclose(rays.sizes(CAMERA, T_cam_origin), distance)
+    assert all(np.isfinite(part).all() for part in rays.normal_equations(CAMERA, T_cam_origin, 1.0, None))
+
+
 def test_an_error_counts_by_how_well_the_observation_is_known_across_the_line():
     sideways = make_transform(np.eye(3), np.array([-1.0, 0.0, 0.0]))
     points, xy = np.array([[0.0, 0.0, 5.0]]), np.array([[220.0, 242.0]])
@@ -128,13 +143,3 @@ def test_outliers_are_weighted_down_and_left_out():
     agreeing = rays.sizes(CAMERA, found.T_cam_world) < 3.0
     assert agreeing[20:].all()
     assert agreeing[:20].mean() < 0.5, "a few lie on their lines by chance"
-
-
-def test_many_put_together_count_as_one_by_one():
-    T, rays = seen_by_two(4)
-    _, others = seen_by_two(5)
-    both = RayObservations.joined([rays, others])
-    assert len(both) == 120
-    parts = [r.normal_equations(CAMERA, T, 1.0, 3.0) for r in (rays, others)]
-    for together, one, other in zip(both.normal_equations(CAMERA, T, 1.0, 3.0), *parts, strict=True):
-        assert np.allclose(together, one + other)
