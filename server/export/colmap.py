@@ -20,6 +20,8 @@ logger = logging.getLogger(__name__)
 
 PIXEL_CENTRE = 0.5
 CAMERA_ID = 1
+#: First line of ``images.txt``: COLMAP's own begins otherwise, so by this an export is known.
+IMAGES_HEADER = "# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
 
 
 def exported_frame_ids(data: RunData, images: Mapping[int, Path]) -> list[int]:
@@ -104,7 +106,7 @@ def _cameras(data: RunData) -> list[str]:
 
 def _images(data: RunData, frame_ids: list[int], rows: NDArray[np.int64]) -> list[str]:
     lines = [
-        "# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME",
+        IMAGES_HEADER,
         "# X Y POINT3D_ID ... of the image above",
     ]
     T_cam_world = invert_transform(data.T_world_cam)

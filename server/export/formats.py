@@ -22,7 +22,7 @@ from semcast.server.export.outputs import MAP_FRAME, read_ply, write_ply
 from semcast.server.export.parts import ALL, LARGEST, count_parts, parts_line, select_part
 from semcast.server.export.placement import Placement
 from semcast.server.export.poses import write_run_kitti, write_run_tum
-from semcast.server.export.replacement import replacing_model
+from semcast.server.export.replacement import MODEL_LISTS, exported_formats, replacing_model
 
 logger = logging.getLogger(__name__)
 
@@ -36,10 +36,6 @@ FORMATS = {
     "nerfstudio": "FOLDER with transforms.json, points and images/ (nerfstudio, gsplat)",
     "rrd": "FILE for the Rerun viewer",
 }
-
-
-#: Format -> the file by which a folder that it was exported to is known.
-_MARKS = {"colmap": "sparse/0/points3D.txt", "nerfstudio": "points3D.ply"}
 
 
 #: Finds the frame to export in, from a run of one part and the images it kept.
@@ -163,12 +159,12 @@ def _check_kind(out: Path, format_name: str) -> None:
 
 
 def _check_not_foreign(out: Path, format_name: str, images: Mapping[int, Path]) -> None:
-    """Refuse a folder with images or a ``transforms.json`` that others need: they would be written over.
+    """Refuse a folder with images or a model that others need: they would be written over.
 
     Those of an earlier export in the same format are; those that the other format's model shows must stay.
     An export that found no room has left some of its images, and no list of them.
     """
-    exported = {name for name, mark in _MARKS.items() if (out / mark).exists()}
+    exported = exported_formats(out)
     if exported == {format_name}:
         return
     ours = {path.name: path for path in images.values()}
@@ -178,8 +174,7 @@ def _check_not_foreign(out: Path, format_name: str, images: Mapping[int, Path]) 
     foreign = [
         f for f in there if f.name not in ours or f.is_dir() or f.read_bytes() != ours[f.name].read_bytes()
     ]
-    if "nerfstudio" not in exported and (out / "transforms.json").exists():
-        foreign.append(out / "transforms.json")
+    foreign += [out / path for f, path in MODEL_LISTS.items() if f not in exported and (out / path).exists()]
     if foreign:
         raise ConfigError(f"out must hold no images of others, there is {foreign[0]}: give another folder")
 

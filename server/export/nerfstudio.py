@@ -17,6 +17,8 @@ from semcast.common.whole_file import write_whole
 from semcast.server.export.colmap import PIXEL_CENTRE, copy_images
 from semcast.server.export.outputs import write_ply
 
+#: Other programs call theirs otherwise (``sparse_pc.ply``), so by this an export is known.
+POINTS_NAME = "points3D.ply"
 #: Our world (first camera: y down, z forward) in a world with z up: x stays, forward becomes y.
 T_up_world = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 
@@ -65,10 +67,10 @@ def write_nerfstudio(
         "p1": 0.0,
         "p2": 0.0,
         "applied_transform": T_out_world[:3].tolist(),
-        "ply_file_path": "points3D.ply",
+        "ply_file_path": POINTS_NAME,
         "frames": frames,
     }
-    transforms, points = folder / "transforms.json", folder / "points3D.ply"
+    transforms, points = folder / "transforms.json", folder / POINTS_NAME
     write_ply(
         points,
         transform_points(T_out_world, data.xyz),

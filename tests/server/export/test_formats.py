@@ -445,6 +445,37 @@ def test_an_export_takes_the_place_of_an_earlier_one_with_all_its_images(
     assert {p.name for p in (out / "images").iterdir()} == {first.name, others[0].name, "mask.png"}
 
 
+OTHERS_MODELS = {
+    "colmap": (
+        "sparse/0/images.txt",
+        "# Image list with two lines of data per image:\n1 1 0 0 0 0 0 0 1 mine.png\n\n",
+    ),
+    "nerfstudio": ("transforms.json", '{"frames": [{"file_path": "images/mine.png"}]}'),
+}
+
+
+@pytest.mark.parametrize("images", ["images", "photographs"])
+@pytest.mark.parametrize("format_name", ["colmap", "nerfstudio"])
+def test_a_model_by_another_program_keeps_its_place_and_its_images(
+    tmp_path, arc_run, write_arc_run, format_name, images
+):
+    write_arc_run(tmp_path / "run", arc_run())
+    out = tmp_path / "project"
+    path, text = OTHERS_MODELS[format_name]
+    for name, content in {
+        path: text,
+        "sparse/0/points3D.txt": "",
+        "points3D.ply": "",
+        f"{images}/mine.png": "original",
+    }.items():
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        (out / name).write_text(content)
+    before = contents(out)
+    with pytest.raises(ConfigError, match="images of others, there is .*: give another folder"):
+        export_run(tmp_path / "run", format_name, out)
+    assert contents(out) == before
+
+
 def test_an_image_that_the_other_formats_model_shows_stays(tmp_path, arc_run, write_arc_run):
     write_arc_run(tmp_path / "run", arc_run())
     out = tmp_path / "out"
