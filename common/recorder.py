@@ -89,6 +89,7 @@ class Recorder:
                 lock(self._stream.fileno())
             self._writer = self._begun(header)
         except OSError as err:
+            self._remove_new_folders()
             raise SourceError(f"{path} can't be written: {_why(err)}") from err
         self._thread = threading.Thread(target=self._run, name="semcast-recorder", daemon=True)
         self._thread.start()
@@ -226,6 +227,9 @@ class Recorder:
             self._path.unlink()
         if self._former is not None:
             self._former.rename(self._path)
+        self._remove_new_folders()
+
+    def _remove_new_folders(self) -> None:
         for folder in self._new_folders:  # the innermost first
             with contextlib.suppress(OSError):  # somebody else put something in
                 folder.rmdir()

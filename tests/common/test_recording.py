@@ -491,6 +491,9 @@ def test_without_room_for_more_than_the_results_nothing_is_begun(tmp_path, monke
     with pytest.raises(SourceError, match="99 MB of the disk are free, of which 100 are kept for results$"):
         Recorder(path, HEADER, results=tmp_path)
     assert path.read_bytes() == b"a recording of hours"
+    with pytest.raises(SourceError, match="99 MB of the disk are free"):
+        Recorder(tmp_path / "new" / "newer" / "run.mcap", HEADER, results=tmp_path)
+    assert [p.name for p in tmp_path.iterdir()] == ["run.mcap"], "folders made for nothing go again"
     with Recorder(path, HEADER) as recorder:  # nothing else is to be written
         recorder.put("t", "pose", b"first")
     assert RecordingReader(path).info().counts["t"] == 1
