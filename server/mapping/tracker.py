@@ -188,7 +188,8 @@ def track_pose(
             rays = rays_of(camera, world, noise, others, submap, with_refuted=with_refuted)
             steady = partial(_with_rays, camera, marks, rays, needed=_STEADY, min_inliers=kept)
             found = [steady(start, is_rough=is_in_doubt) for start in starts]
-            steadied = [p for p in found if p is not None and _is_borne_out(p, best, marks, rays, camera)]
+            is_good = partial(_is_borne_out, before=best, marks=marks, rays=rays, is_in_doubt=is_in_doubt)
+            steadied = [p for p in found if p is not None and is_good(p, camera=camera)]
             if steadied:
                 cost = partial(_cost, marks=marks, rays=rays, camera=camera)
                 best = steadied[0] if len(steadied) == 1 else min(steadied, key=cost)
@@ -299,16 +300,22 @@ def _is_borne_out(
     marks: _SeenLandmarks,
     rays: RayObservations | None,
     camera: Intrinsics,
+    *,
+    is_in_doubt: bool,
 ) -> bool:
-    """Whether landmarks agree with a pose that rays have steadied, but for what noise does to them."""
-    if _turn_is_in_doubt(before, camera):
+    """Tell whether a pose that rays have steadied may take the place of the landmarks' own.
+
+    Landmarks must agree with it, but for what noise does to them. Where they leave the turn in doubt, it must
+    fit landmarks and rays together better.
+    """
+    if is_in_doubt:
         return _cost(steadied, marks, rays, camera) < _cost(before, marks, rays, camera)
     most_taken = _MOST_TAKEN + _MOST_TAKEN_EACH * len(marks.xyz)
     return _cost(steadied, marks) < _cost(before, marks) + most_taken
 
 
 def _turn_is_in_doubt(pose: PoseEstimate, camera: Intrinsics) -> bool:
-    """Whether landmarks alone leave it open by how much the camera turned."""
+    """Tell whether landmarks alone leave it open by how much the camera turned."""
     if pose.covariance is None:
         return True
     sigma_rad = np.sqrt(np.linalg.eigvalsh(pose.covariance[:3, :3])[-1])
