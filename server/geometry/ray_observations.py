@@ -112,6 +112,8 @@ class _AtPose:
         # A camera that has only turned, or went straight ahead on the ray, sees no line but a point: any
         # direction will do.
         way = np.where(has_way, way / np.maximum(length, _NO_WAY_PX), [[1.0], [0.0]])
+        # Where errors have a shape, the best depth is a little beside the foot of the perpendicular. The
+        # distance from the line is the same there, and poses become no better for it.
         x, y = rays.observed - focal_px * infinity[:2]
         along, across = x * way[0] + y * way[1], y * way[0] - x * way[1]
         at_end = 1.0 + rays.nearest * origin[2]
