@@ -19,7 +19,7 @@ from semcast.server.geometry.weighting import HUBER_K
 
 Array = NDArray[np.float64]
 
-#: Part of the depth in the other camera that a point must have in this one.
+#: A ray must go ahead in this camera by at least this part of what it does in the other one.
 _MIN_DEPTH_RATIO = 0.05
 #: Pixels per inverse depth below which a point stays where it is in the image, however near it is.
 _NO_WAY_PX = 1e-9
@@ -32,7 +32,7 @@ class RayObservations:
     Attributes:
         origin: ``(3, N)`` centres of the cameras that saw the points, world frame.
         direction: ``(3, N)`` the rays, at a depth of 1 in those cameras, world frame.
-        nearest: ``(N,)`` largest inverse depth in those cameras.
+        min_depth: ``(N,)`` least depth of the points in those cameras and in this one, map units.
         observed: ``(2, N)`` pixels from the principal point.
         covariance: ``(3, N)`` xx, xy and yy of the observations, with that of the other camera's, pixels^2.
         gate: ``(N,)`` distance in standard deviations up to which an observation agrees.
@@ -40,7 +40,7 @@ class RayObservations:
 
     origin: Array
     direction: Array
-    nearest: Array
+    min_depth: Array
     observed: Array
     covariance: Array
     gate: Array
@@ -108,18 +108,16 @@ class _AtPose:
         # How the projection moves as the point comes nearer, and how far on that way the observation is.
         way = focal_px * (origin[:2] - infinity[:2] * origin[2])
         length = np.hypot(way[0], way[1])
-        has_way = length > _NO_WAY_PX
         # A camera that has only turned, or went straight ahead on the ray, sees no line but a point: any
         # direction will do.
-        way = np.where(has_way, way / np.maximum(length, _NO_WAY_PX), [[1.0], [0.0]])
+        way = np.where(length > _NO_WAY_PX, way / np.maximum(length, _NO_WAY_PX), [[1.0], [0.0]])
         # Where errors have a shape, the best depth is a little beside the foot of the perpendicular. The
         # distance from the line is the same there, and poses become no better for it.
         x, y = rays.observed - focal_px * infinity[:2]
         along, across = x * way[0] + y * way[1], y * way[0] - x * way[1]
-        at_end = 1.0 + rays.nearest * origin[2]
-        end = rays.nearest * length / np.maximum(at_end, _MIN_DEPTH_RATIO)
-        is_endless = has_way & (at_end <= _MIN_DEPTH_RATIO)
-        on_ray = np.minimum(np.maximum(along, 0.0), np.where(is_endless, np.inf, end))
+        # A camera that went ahead has passed what is nearer to the other one.
+        end_depth = np.maximum(rays.min_depth, rays.min_depth / z - origin[2])
+        on_ray = np.minimum(np.maximum(along, 0.0), length / (end_depth + origin[2]))
         beyond = along - on_ray
         inverse_depth = on_ray / np.maximum(length - on_ray * origin[2], 1e-12)
         per_sigma = 1.0 / np.sqrt(_variances(rays.covariance, way))

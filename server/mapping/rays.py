@@ -30,7 +30,7 @@ Ids = NDArray[np.int64]
 
 #: Keyframes whose tracks are looked at.
 _NUM_KEYFRAMES = 12
-#: A point lies at least this share of the usual depth in front of the keyframe.
+#: A point lies at least this share of the usual depth in front of the cameras.
 _MIN_DEPTH_SHARE = 0.05
 
 
@@ -111,7 +111,7 @@ def _on_rays(parts: Sequence[_Part], camera: Intrinsics, noise: NoiseModel, seen
     return RayObservations(
         origin=np.repeat([part.keyframe.T_world_cam[:3, 3] for part in parts], counts, axis=0).T.copy(),
         direction=np.concatenate(rays, axis=1),
-        nearest=np.repeat([1.0 / (_MIN_DEPTH_SHARE * part.depth) for part in parts], counts),
+        min_depth=np.repeat([_MIN_DEPTH_SHARE * part.depth for part in parts], counts),
         observed=(now.xy - (camera.cx, camera.cy)).T.copy(),
         covariance=np.stack([covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]]),
         gate=np.minimum(gate_px / sigma_px, gate_then_px / sigma_then_px),

@@ -16,7 +16,7 @@ from semcast.server.geometry.pnp import refine_pose
 from semcast.server.geometry.ray_observations import RayObservations
 
 CAMERA = Intrinsics(fx=500, fy=480, cx=320, cy=240, width=640, height=480)
-NEAREST = 1.0
+MIN_DEPTH = 1.0
 
 
 def seen_by_two(seed, num=60, T_world_origin=None, T_cam_origin=None):
@@ -31,12 +31,12 @@ def seen_by_two(seed, num=60, T_world_origin=None, T_cam_origin=None):
     )
 
 
-def on_rays(T_world_origin, points_origin, xy, covariance=(1.0, 0.0, 1.0), nearest=NEAREST):
+def on_rays(T_world_origin, points_origin, xy, covariance=(1.0, 0.0, 1.0), min_depth=MIN_DEPTH):
     num = len(points_origin)
     return RayObservations(
         origin=np.repeat(T_world_origin[:3, 3:], num, axis=1),
         direction=T_world_origin[:3, :3] @ (points_origin / points_origin[:, 2:]).T,
-        nearest=np.full(num, nearest),
+        min_depth=np.full(num, min_depth),
         observed=(xy - (CAMERA.cx, CAMERA.cy)).T,
         covariance=np.repeat(np.asarray(covariance, float)[:, None], num, axis=1),
         gate=np.full(num, 3.0),
@@ -75,13 +75,24 @@ def test_beyond_the_ends_of_a_ray_the_way_along_it_counts():
     assert np.allclose(rays.sizes(CAMERA, sideways), [10.0, 0.0, 0.0, np.hypot(20.0, 3.0)])
 
 
-def test_a_camera_that_goes_past_a_point_sees_it_go_out_of_the_image():
+def test_a_camera_that_goes_ahead_has_passed_what_is_nearer():
     ahead = make_transform(np.eye(3), np.array([0.0, 0.0, -2.0]))
-    points = np.array([[0.5, 0.0, 5.0]] * 2)
-    # At a depth of 2 in the other camera the point is beside this one, so the line never ends.
-    xy = np.array([[320.0 + 1e5, 240.0], [321.0, 240.0]])
-    sizes = on_rays(np.eye(4), points, xy).sizes(CAMERA, ahead)
-    assert np.allclose(sizes, [0.0, 49.0]), "nearer than infinity is further out"
+    points = np.array([[0.5, 0.0, 5.0]] * 3)
+    # Infinitely far the point is at 370; at a depth of 3 in the other camera it is at 1 in this one, at 470.
+    xy = np.array([[321.0, 240.0], [420.0, 240.0], [500.0, 240.0]])
+    assert np.allclose(on_rays(np.eye(4), points, xy).sizes(CAMERA, ahead), [49.0, 0.0, 30.0])
+
+
+def test_a_track_next_to_where_the_camera_goes_does_not_rule_its_way():
+    ahead = make_transform(np.eye(3), np.array([0.0, 0.0, -2.0]))
+    points = np.array([[x, 0.0, 5.0] for x in (1.0, 1e-3, 1e-6)])
+    # Thirty pixels from there, which of the three only the first one could be.
+    rays = on_rays(np.eye(4), points, np.array([[350.0, 240.0]] * 3))
+    assert np.allclose(rays.sizes(CAMERA, ahead), [70.0, 29.7, 30.0], atol=0.1)
+    for row in range(3):
+        one = on_rays(np.eye(4), points[row : row + 1], np.array([[350.0, 240.0]]))
+        hessian, _ = one.normal_equations(CAMERA, ahead, 1e6, None)
+        assert hessian[3:, 3:].max() < (500.0 / MIN_DEPTH) ** 2, "as of a point at the least depth"
 
 
 def test_points_behind_the_camera_are_off_by_anything():

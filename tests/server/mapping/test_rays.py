@@ -84,7 +84,7 @@ def test_a_track_is_on_a_ray_from_the_newest_keyframe_that_saw_it():
     variance = 0.25 + 0.25 * np.where(by_newest, np.exp(2.0 * 0.5), 1.0)
     np.testing.assert_allclose(rays.covariance, [variance, np.zeros(NUM - 20), variance], atol=1e-12)
     depth = np.median(xyz[:20] @ invert_transform(MOVED)[2, :3] + invert_transform(MOVED)[2, 3])
-    np.testing.assert_allclose(rays.nearest[by_newest], 1.0 / (0.05 * depth))
+    np.testing.assert_allclose(rays.min_depth[by_newest], 0.05 * depth)
 
 
 def test_what_neither_image_is_sure_of_is_no_proof():
