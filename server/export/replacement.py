@@ -72,13 +72,14 @@ def _is_exported(folder: Path, format_name: str) -> bool:
 
 
 def _pictures(folder: Path, format_name: str) -> set[str]:
-    """Return the names in ``images/`` that a model in a folder shows; none of one that can't be read."""
+    """Return the names in ``images/`` itself that a model in a folder shows; none where it can't be read."""
     try:
         text = (folder / MODEL_LISTS[format_name]).read_text(encoding="utf-8")
         if format_name == "colmap":
             # Two lines each, of which the second one may be empty.
             lines = [line for line in text.splitlines() if not line.startswith("#")]
-            return {line.split()[-1] for line in lines[::2]}
+            names = {line.split()[-1] for line in lines[::2]}
+            return {name for name in names if PurePosixPath(name).name == name}
         paths = [PurePosixPath(frame["file_path"]) for frame in json.loads(text)["frames"]]
     except (OSError, ValueError, LookupError, TypeError):
         return set()

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -177,22 +176,13 @@ def track_pose(
     best = _pose_from_landmarks(camera, marks, T_world_guess, seed, is_after_gap=is_after_gap)
     enough = max(MIN_INLIERS, min_share * len(marks.xyz))
     if best is not None and best.num_inliers >= enough and np.isfinite(best.T_cam_world).all():
-        is_in_doubt = _turn_is_in_doubt(best, camera)
-        kept = enough if is_in_doubt else max(enough, _MIN_KEPT_SHARE * best.num_inliers)
-        starts = [best.T_cam_world]
-        if T_world_guess is not None and is_in_doubt:
-            starts.append(invert_transform(T_world_guess))
         # Near landmarks at one depth can't tell a turn from a way. Keyframes that followed them refute the
         # far view, which can: so all tracks are asked first, and landmarks tell whether they may be right.
         for with_refuted in (True, False) if much_is_refuted(world, submap) else (False,):
             rays = rays_of(camera, world, noise, others, submap, with_refuted=with_refuted)
-            steady = partial(_with_rays, camera, marks, rays, needed=_STEADY, min_inliers=kept)
-            found = [steady(start, is_rough=is_in_doubt) for start in starts]
-            is_good = partial(_is_borne_out, before=best, marks=marks, rays=rays, is_in_doubt=is_in_doubt)
-            steadied = [p for p in found if p is not None and is_good(p, camera=camera)]
-            if steadied:
-                cost = partial(_cost, marks=marks, rays=rays, camera=camera)
-                best = steadied[0] if len(steadied) == 1 else min(steadied, key=cost)
+            steadied = _steadied(camera, marks, rays, best, T_world_guess, enough)
+            if steadied is not None:
+                best = steadied
                 break
     elif may_carry and T_world_guess is not None and len(marks.xyz) < _RUN_OUT:
         rays = rays_of(camera, world, noise, others, submap)
@@ -248,6 +238,43 @@ def _pose_from_landmarks(
         searched = search_pose(camera, *observed, seed=seed, min_inliers=needed, edge=edge)
         if searched is not None and (best is None or searched.num_inliers > best.num_inliers):
             best = searched
+    return best
+
+
+def _steadied(
+    camera: Intrinsics,
+    marks: _SeenLandmarks,
+    rays: RayObservations | None,
+    before: PoseEstimate,
+    T_world_guess: Array | None,
+    enough: float,
+) -> PoseEstimate | None:
+    """Pose that landmarks and rays fit best, from the landmarks' own and, in doubt, from the expected one.
+
+    Args:
+        camera: Pinhole.
+        marks: Tracks that have a landmark.
+        rays: Those that have none.
+        before: The landmarks' own pose.
+        T_world_guess: Expected pose or None.
+        enough: Landmarks that must agree, in doubt; else it is most of those that agreed before as well.
+
+    Returns:
+        The pose with the landmarks it agrees with; None where rays fit none that landmarks bear out.
+    """
+    is_in_doubt = _turn_is_in_doubt(before, camera)
+    kept = enough if is_in_doubt else max(enough, _MIN_KEPT_SHARE * before.num_inliers)
+    starts = [before.T_cam_world]
+    if is_in_doubt and T_world_guess is not None:
+        starts.append(invert_transform(T_world_guess))
+    best, least = None, np.inf
+    for start in starts:
+        found = _with_rays(camera, marks, rays, start, _STEADY, kept, is_rough=is_in_doubt)
+        if found is None or not _is_borne_out(found, before, marks, rays, camera, is_in_doubt=is_in_doubt):
+            continue
+        cost = _cost(found, marks, rays, camera)
+        if cost < least:
+            best, least = found, cost
     return best
 
 
