@@ -45,6 +45,8 @@ _MOST_TAKEN_EACH = 0.2
 #: Landmarks leave a turn in doubt where its standard deviation is more pixels than this. They lie together
 #: then, so their own errors are alike: rays may contradict them by as much as they gain, while most agree.
 _TURN_IN_DOUBT_PX = 1.0
+#: Steps by which rays steady a pose that landmarks are sure of, and one that they are not.
+_FEW_STEPS, _MOST_STEPS = 6, 10
 #: With fewer landmarks in sight than this, rays may carry the pose on.
 _RUN_OUT = 30
 #: Number and share of rays that must agree for that.
@@ -187,7 +189,9 @@ def track_pose(
     elif may_carry and T_world_guess is not None and len(marks.xyz) < _RUN_OUT:
         rays = rays_of(camera, world, noise, others, submap)
         left = max(_MIN_LEFT, min_share * len(marks.xyz))
-        best = _with_rays(camera, marks, rays, invert_transform(T_world_guess), _CARRY, left, is_rough=True)
+        best = _with_rays(
+            camera, marks, rays, invert_transform(T_world_guess), _CARRY, left, iterations=_MOST_STEPS
+        )
     else:
         best = None
     if best is None:
@@ -267,9 +271,10 @@ def _steadied(
     starts = [before.T_cam_world]
     if is_in_doubt and T_world_guess is not None:
         starts.append(invert_transform(T_world_guess))
+    iterations = _MOST_STEPS if is_in_doubt else _FEW_STEPS
     best, least = None, np.inf
     for start in starts:
-        found = _with_rays(camera, marks, rays, start, _STEADY, kept, is_rough=is_in_doubt)
+        found = _with_rays(camera, marks, rays, start, _STEADY, kept, iterations=iterations)
         if found is None or not _is_borne_out(found, before, marks, rays, camera, is_in_doubt=is_in_doubt):
             continue
         cost = _cost(found, marks, rays, camera)
@@ -286,7 +291,7 @@ def _with_rays(
     needed: tuple[int, float],
     min_inliers: float,
     *,
-    is_rough: bool,
+    iterations: int,
 ) -> PoseEstimate | None:
     """Refine a pose with what the tracks without a landmark say too.
 
@@ -297,7 +302,8 @@ def _with_rays(
         T_cam_world: Where to begin.
         needed: Number of rays that must agree, and the share of all rays.
         min_inliers: Landmarks that must agree.
-        is_rough: The beginning is.
+        iterations: Steps at most. The first ones ask all rays, also those far off: what moves by itself would
+            be told by none else, and pull a little.
 
     Returns:
         The pose with the landmarks it agrees with; None where too few agree.
@@ -305,16 +311,8 @@ def _with_rays(
     if rays is None or len(rays) < needed[0]:
         return None
     observed = (marks.xyz, marks.tracks.xy, marks.sigma_px, marks.gate_px)
-    iterations = 10 if is_rough else 4
-    pose = refine_pose(
-        camera,
-        T_cam_world,
-        *observed,
-        iterations=iterations,
-        rays=rays,
-        edge=marks.tracks.edge,
-        is_rough=is_rough,
-    )
+    edge = marks.tracks.edge
+    pose = refine_pose(camera, T_cam_world, *observed, iterations=iterations, rays=rays, edge=edge)
     num_agreeing = int((rays.sizes(camera, pose.T_cam_world) < rays.gate).sum())
     if pose.num_inliers < min_inliers or num_agreeing < max(needed[0], needed[1] * len(rays)):
         return None
