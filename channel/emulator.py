@@ -117,7 +117,7 @@ class Emulator:
             if frame is None:
                 self._silence.check()
                 continue
-            self._silence.end()
+            self._silence.on_frame()
             with carrying:
                 try:
                     with self._metrics.stage("channel"):

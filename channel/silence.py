@@ -12,7 +12,7 @@ _WATCHED = ("agent", "server")
 
 
 class Silence:
-    """Notes who is there and when a frame came, from any thread; ``check`` is called by one.
+    """Notes who is there, told by any thread, and when a frame came; frames and ``check`` are of one.
 
     Args:
         agent_id: Whose frames are waited for.
@@ -38,7 +38,7 @@ class Silence:
         if is_change and alive is not None:
             logger.info("%s %s", role, "is there" if alive else "is gone")
 
-    def end(self) -> None:
+    def on_frame(self) -> None:
         """Take that a frame came."""
         self._since_s, self._is_told = time.monotonic(), False
 

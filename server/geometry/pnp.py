@@ -92,12 +92,13 @@ def refine_pose(
     for iteration in range(iterations):
         # Early steps are more tolerant, so that a poor start does not lose the points that would mend it.
         is_early = is_rough and iteration < 2
-        equations = seen.normal_equations(T, 4.0 if is_early else 1.0, None if is_early else far_px)
+        tolerance = 4.0 if is_early else 1.0
+        equations = seen.normal_equations(T, tolerance, None if is_early else far_px)
         step = None
         if equations is not None:
             hessian, gradient = equations
             if rays is not None:
-                more = rays.normal_equations(camera, T, 4.0 if is_early else 1.0, None if is_early else 3.0)
+                more = rays.normal_equations(camera, T, tolerance, None if is_early else 3.0)
                 hessian, gradient = hessian + more[0], gradient + more[1]
             step = _damped_step(hessian, gradient)
         if step is None:

@@ -82,7 +82,7 @@ class _AtPose:
         used: ``(N,)`` bool, which are in front of the camera.
         axes: ``(2, 2, N)`` by how much a projection at unit depth (first index) moves each residual. Along
             the line it is zero on the ray, where the depth follows.
-        xyz: ``(3, N)`` the points, camera frame, divided by their inverse depth and by ``z``.
+        xyz: ``(3, N)`` the points, camera frame, times their inverse depth and divided by ``z``.
         inverse_depth: ``(N,)`` in the other camera.
         z: ``(N,)`` depth of the ray's direction in this camera.
     """

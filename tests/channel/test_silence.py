@@ -18,7 +18,7 @@ def test_silence_is_told_once_with_who_is_missing(told):
     silence.check()
     said = "no frame of agent 'left' has come for 0 s: no agent of this name (another --agent-id?)"
     assert told() == ["server is there", said]
-    silence.end()
+    silence.on_frame()
     silence.on_alive("agent", True)
     silence.check()
     assert told()[2:] == ["agent is there", "no frame of agent 'left' has come for 0 s: it sends none"]
