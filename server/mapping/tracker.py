@@ -255,6 +255,9 @@ def _steadied(
 ) -> PoseEstimate | None:
     """Pose that landmarks and rays fit best, from the landmarks' own and, in doubt, from the expected one.
 
+    Landmarks must agree with it, but for what noise does to them. Where they leave the turn in doubt, it must
+    fit landmarks and rays together better than their own pose.
+
     Args:
         camera: Pinhole.
         marks: Tracks that have a landmark.
@@ -271,14 +274,13 @@ def _steadied(
     starts = [before.T_cam_world]
     if is_in_doubt and T_world_guess is not None:
         starts.append(invert_transform(T_world_guess))
-    iterations = _MOST_STEPS if is_in_doubt else _FEW_STEPS
-    best, least = None, np.inf
+    iterations, compared = (_MOST_STEPS, rays) if is_in_doubt else (_FEW_STEPS, None)
+    best, least = None, _cost(before, marks, compared, camera)
+    if not is_in_doubt:
+        least += _MOST_TAKEN + _MOST_TAKEN_EACH * len(marks.xyz)
     for start in starts:
         found = _with_rays(camera, marks, rays, start, _STEADY, kept, iterations=iterations)
-        if found is None or not _is_borne_out(found, before, marks, rays, camera, is_in_doubt=is_in_doubt):
-            continue
-        cost = _cost(found, marks, rays, camera)
-        if cost < least:
+        if found is not None and (cost := _cost(found, marks, compared, camera)) < least:
             best, least = found, cost
     return best
 
@@ -302,8 +304,8 @@ def _with_rays(
         T_cam_world: Where to begin.
         needed: Number of rays that must agree, and the share of all rays.
         min_inliers: Landmarks that must agree.
-        iterations: Steps at most. The first ones ask all rays, also those far off: what moves by itself would
-            be told by none else, and pull a little.
+        iterations: Steps at most. The first ones ask all rays, also those far off: something that moves by
+            itself then contradicts the landmarks, where a few of its tracks alone would pull a little.
 
     Returns:
         The pose with the landmarks it agrees with; None where too few agree.
@@ -319,26 +321,6 @@ def _with_rays(
     return pose
 
 
-def _is_borne_out(
-    steadied: PoseEstimate,
-    before: PoseEstimate,
-    marks: _SeenLandmarks,
-    rays: RayObservations | None,
-    camera: Intrinsics,
-    *,
-    is_in_doubt: bool,
-) -> bool:
-    """Tell whether a pose that rays have steadied may take the place of the landmarks' own.
-
-    Landmarks must agree with it, but for what noise does to them. Where they leave the turn in doubt, it must
-    fit landmarks and rays together better.
-    """
-    if is_in_doubt:
-        return _cost(steadied, marks, rays, camera) < _cost(before, marks, rays, camera)
-    most_taken = _MOST_TAKEN + _MOST_TAKEN_EACH * len(marks.xyz)
-    return _cost(steadied, marks) < _cost(before, marks) + most_taken
-
-
 def _turn_is_in_doubt(pose: PoseEstimate, camera: Intrinsics) -> bool:
     """Tell whether landmarks alone leave it open by how much the camera turned."""
     if pose.covariance is None:
@@ -348,13 +330,10 @@ def _turn_is_in_doubt(pose: PoseEstimate, camera: Intrinsics) -> bool:
 
 
 def _cost(
-    pose: PoseEstimate,
-    marks: _SeenLandmarks,
-    rays: RayObservations | None = None,
-    camera: Intrinsics | None = None,
+    pose: PoseEstimate, marks: _SeenLandmarks, rays: RayObservations | None, camera: Intrinsics
 ) -> float:
-    """Sum of the squared errors of landmarks and of rays in standard deviations, each cut off."""
+    """Sum of the squared errors of landmarks, and of rays if given, in standard deviations, each cut off."""
     sizes = pose.residual_px / marks.sigma_px
-    if rays is not None and camera is not None:
+    if rays is not None:
         sizes = np.concatenate([sizes, rays.sizes(camera, pose.T_cam_world)])
     return float((np.minimum(sizes, _CUT_SIGMAS) ** 2).sum())
