@@ -129,9 +129,11 @@ def _run(settings: ServerRunSettings, stream: RecordedStream) -> dict[str, Any]:
         threading.Thread(target=watch, name="semcast-server", daemon=True).start()
         try:
             played = run_play(settings.play_to(NetworkSettings(connect=(endpoint,))), has_ended)
-            has_ended.wait(_CONCLUDED_S)
+            in_time = has_ended.wait(_CONCLUDED_S)
         finally:
             server.stop()
+        if not in_time:
+            raise SemcastError(f"the server did not end within {_CONCLUDED_S:g} s: {server.last_words()}")
         if not played["complete"] or server.returncode or not (out / SUMMARY_NAME).is_file():
             raise SemcastError(f"the server did not get to the end: {server.last_words()}")
         summary = json.loads((out / SUMMARY_NAME).read_text(encoding="utf-8"))

@@ -48,7 +48,7 @@ class Announcement:
     """The newest stream that was announced and not begun on yet.
 
     Args:
-        session: Where agents announce themselves; one that is there already is asked.
+        session: Where agents announce themselves; one that is there already, or comes, is asked.
         agent_id: Whose streams.
     """
 
@@ -58,8 +58,8 @@ class Announcement:
         self._lock = threading.Lock()
         self._newest: CameraInfo | None = None
         session.subscribe(camera_key(agent_id), "every", self._hear)
-        if "agent" in session.alive_roles(agent_id, CAMERA_TIMEOUT_S):
-            self._note(answered_camera(session, agent_id))
+        # One that announced itself a moment before this was subscribed, and is there a moment after.
+        session.watch_alive(agent_id, self._on_alive)
 
     def _hear(self, payload: bytes) -> None:
         """Note an announced stream; the receiver counts and reports what is not valid.
@@ -68,11 +68,17 @@ class Announcement:
         first frame.
         """
         camera = _unpack_or_none(payload)
-        with contextlib.suppress(TransportError):
-            if camera is not None:
-                self._note(answered_camera(self._session, self._agent_id, camera.agent_epoch, _STAND_BY_S))
+        if camera is not None:
+            self._ask(camera.agent_epoch)
 
-    def _note(self, camera: CameraInfo | None) -> None:
+    def _on_alive(self, role: str, alive: bool | None) -> None:
+        if role == "agent" and alive:
+            self._ask(None)
+
+    def _ask(self, agent_epoch: int | None) -> None:
+        camera = None
+        with contextlib.suppress(TransportError):
+            camera = answered_camera(self._session, self._agent_id, agent_epoch, _STAND_BY_S)
         with self._lock:
             if camera is not None and (self._newest is None or camera.agent_epoch > self._newest.agent_epoch):
                 self._newest = camera

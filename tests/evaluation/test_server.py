@@ -95,6 +95,12 @@ def test_a_stream_that_the_server_cannot_decode_is_no_result(tmp_path):
         evaluate_server(ServerRunSettings(file=other, pace=4.0, runs=1))
 
 
+def test_a_server_that_does_not_end_is_told(file, monkeypatch):
+    monkeypatch.setattr(server, "_CONCLUDED_S", 0.01)
+    with pytest.raises(SemcastError, match=r"the server did not end within 0\.01 s: "):
+        evaluate_server(ServerRunSettings(file=file, pace=4.0))
+
+
 def test_an_interruption_leaves_the_runs_before_it(file, tmp_path, monkeypatch):
     runs = iter([{"frames": {}, "drops": {}, "completeness": 1.0, "stage_ms": {}}])
 
