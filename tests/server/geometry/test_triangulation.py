@@ -3,7 +3,7 @@ import pytest
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3, invert_transform, make_transform, transform_points
-from semcast.server.geometry.triangulation import triangulate
+from semcast.server.geometry.triangulation import mean_centre, triangulate
 
 CAMERA = Intrinsics(fx=500, fy=480, cx=320, cy=240, width=640, height=480)
 
@@ -126,3 +126,9 @@ def test_parallax_along_an_edge_hardly_counts():
     upright = triangulate(*how, edge=np.tile([0.0, length], (len(xy), 1))).parallax_deg
     assert np.allclose(lying, free / np.sqrt(10.0)), "the camera goes along them"
     assert np.allclose(upright, free), "and across these, which is not worth more than at a corner"
+
+
+def test_the_mean_centre_is_that_of_a_point_s_own_views():
+    centre = np.array([[1.0, 0.0, 0.0], [3.0, 0.0, 2.0], [0.0, 5.0, 0.0]])
+    mean = mean_centre(centre, np.array([0, 0, 2]), 3)
+    np.testing.assert_array_equal(mean, [[2.0, 0.0, 1.0], [0.0, 0.0, 0.0], [0.0, 5.0, 0.0]])

@@ -1,5 +1,7 @@
 """Structures a start may be go on with later frames, each as itself."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from semcast.server.geometry.weighting import NoiseModel
@@ -17,6 +19,13 @@ def views_of(problem):
         Observed(k, k * 10**8, problem.point[mine], problem.xy[mine], np.ones(int(mine.sum())))
         for k, mine in ((k, problem.view == k) for k in range(len(problem.T_world_cam)))
     ]
+
+
+def only(view, sees):
+    """Return a frame with a part of its tracks."""
+    return replace(
+        view, ids=view.ids[sees], xy=view.xy[sees], confidence=view.confidence[sees], edge=view.edge[sees]
+    )
 
 
 def test_later_frames_are_posed_in_the_structure_of_earlier_ones(arc):
@@ -59,3 +68,14 @@ def test_all_structures_are_judged_by_the_same_observations(arc):
     assert len(right.landmark_ids) == 90, "the longest tracks"
     np.testing.assert_allclose(right.xyz, truth.xyz[right.landmark_ids], atol=0.2)
     assert np.isfinite(other.xyz).all()
+
+
+def test_what_two_views_saw_counts_and_what_one_saw_alone_does_not(arc):
+    truth = arc(focal_px=600.0, depth=4.0, noise_px=0.3, num_views=3, turn_deg=8.0)
+    views = views_of(truth)
+    parts = (slice(1, 9), slice(0, 8), slice(1, 8))
+    views = [only(view, sees) for view, sees in zip(views, parts, strict=True)]
+    problem = problem_of(views, truth.T_world_cam, truth.camera, NOISE)
+    assert len(problem.xyz) == 7, "the first and the last of the nine are seen once"
+    views[2] = only(views[2], slice(0, 6))
+    assert len(problem_of(views, truth.T_world_cam, truth.camera, NOISE).xyz) == 7, "twice is enough"

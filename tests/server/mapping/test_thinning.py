@@ -1,8 +1,23 @@
 """A map at its limits forgets a little everywhere."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
-from semcast.server.mapping.thinning import evenly_thinned, least_needed
+from semcast.server.mapping.thinning import evenly_thinned, gaps_among, hung_on_what_is_left, least_needed
+
+
+@dataclass
+class Kept:
+    """A keyframe as far as thinning looks at it."""
+
+    frame_id: int
+    submap: int = 0
+    first_track: int = 0
+
+    @property
+    def ids(self):
+        return np.arange(self.first_track, self.first_track + 50)
 
 
 def test_keyframes_that_are_left_are_as_far_apart_as_they_can_be():
@@ -44,3 +59,34 @@ def test_landmarks_of_late_stay_as_long_as_others_can_go():
     last_seen = np.array([1, 1, 8, 8, 8, 8])
     assert set(least_needed(seen, last_seen, 8, 2).tolist()) == {0, 1}
     assert least_needed(seen, np.array([1, 1, 9, 8, 9, 9]), 8, 3).tolist()[2] == 3, "the last seen go last"
+
+
+def test_behind_a_gap_are_first_keyframes_and_those_that_follow_no_track_of_the_one_before():
+    keyframes = [
+        Kept(0),
+        Kept(3, first_track=1000),
+        Kept(6, first_track=1001),
+        Kept(9, 1, 2000),
+        Kept(12, 0, 1002),
+    ]
+    submap_of = {k.frame_id: k.submap for k in keyframes}
+    assert gaps_among(keyframes, submap_of) == {0, 3, 9}
+    # Between two that are left another one was: nothing says that it shared no track with them.
+    del keyframes[1]
+    assert gaps_among(keyframes, submap_of) == {0, 9}
+
+
+def test_a_gap_is_told_where_two_keyframes_are_all_there_are():
+    keyframes = [Kept(0), Kept(3, first_track=1000)]
+    assert gaps_among(keyframes, {0: 0, 3: 0}) == {0, 3}
+
+
+def test_a_revisit_hangs_on_the_kept_keyframe_next_in_time_in_its_own_part():
+    submap_of = {0: 0, 10: 0, 48: 0, 50: 1, 90: 0}
+    kept = [Kept(0), Kept(50, 1), Kept(90)]
+    assert hung_on_what_is_left({90: 10}, kept, submap_of) == {90: 0}
+    assert hung_on_what_is_left({48: 0}, kept, submap_of) == {90: 0}, "50 is nearer, but of another part"
+    assert hung_on_what_is_left({10: 0}, kept, submap_of) == {}, "both ends are the same one now"
+    assert hung_on_what_is_left({90: 50}, [Kept(0), Kept(90)], submap_of) == {}, (
+        "nothing is left of that part"
+    )
