@@ -77,6 +77,15 @@ def begun_as(problem, structure):
     return replace(problem, T_world_cam=structure.T_world_cam, xyz=structure.xyz), structure.doubt
 
 
+def test_doubt_counts_as_far_as_it_is_more_than_that_of_the_best_structure(wall):
+    short = wall(way=(0.06, 0.02, 0.04), turn_deg=(0.3, -0.6, 0.0), noise_px=0.6)
+    _, structures = decide(short)
+    doubted = [replace(structure, doubt=3.0) for structure in structures]
+    assert decide(short, [begun_as(short, structure) for structure in doubted])[0] is None
+    doubted[0] = replace(doubted[0], doubt=0.0)
+    assert decide(short, [begun_as(short, structure) for structure in doubted])[0] is not None
+
+
 def test_a_structure_that_fits_a_little_better_each_time_is_believed_in_the_end(wall, direction_error_deg):
     """The same views with other noise, whose structures go on from one attempt to the next."""
     believed, carried, doubts = None, [], []
