@@ -1,6 +1,8 @@
 """Tracks found again after a jump."""
 
+import cv2
 import numpy as np
+import pytest
 
 from semcast.server.geometry.wide_search import (
     WideFeatures,
@@ -35,6 +37,20 @@ def test_images_without_anything_give_no_places():
     blank = WideFeatures.of(np.full((240, 320), 90, np.uint8))
     assert search_wide(blank, blank, np.zeros((0, 2))) is None
     assert search_wide(blank, blank, np.full((30, 2), 100.0)) is None
+
+
+@pytest.mark.parametrize("width", [400, 401])
+def test_features_of_an_image_searched_at_half_its_width_are_where_they_are(width):
+    """Blobs on a coarse grid: each has a feature at its centre, to a part of a pixel."""
+    centres = np.stack(np.meshgrid(np.arange(60, 360, 60), np.arange(60, 300, 60)), axis=-1).reshape(-1, 2)
+    image = np.full((330, width), 60, np.uint8)
+    for x, y in centres.tolist():
+        cv2.circle(image, (x, y), 9, 200, -1, cv2.LINE_AA)
+    image = cv2.GaussianBlur(image, (0, 0), 2.0)
+    for fine in (False, True):
+        xy = WideFeatures.of(image, fine=fine).xy
+        nearest = np.linalg.norm(centres[:, None] - xy, axis=2).min(axis=1)
+        assert nearest.max() < 0.1
 
 
 def features_at(xy, descriptors):
