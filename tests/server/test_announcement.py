@@ -45,3 +45,15 @@ def test_an_agent_that_announced_itself_too_early_to_be_heard_is_asked_when_it_i
         while (taken := announced.take()) is None and time.monotonic() < until_s:
             time.sleep(0.01)
         assert taken == camera(3)
+
+
+def test_of_several_announced_streams_the_newest_is_begun_on(session):
+    announced = Announcement(session, "a")
+    for epoch in (5, 8, 3):
+        session.publisher(camera_key("a"), "every").put(pack(camera(epoch)))
+    until_s = time.monotonic() + 10.0
+    while not announced.is_newer(5) and time.monotonic() < until_s:
+        time.sleep(0.01)
+    time.sleep(0.2)  # the oldest comes last
+    assert announced.take() == camera(8)
+    assert announced.take() is None
