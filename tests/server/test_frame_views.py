@@ -51,6 +51,12 @@ def test_what_was_lost_on_the_air_leaves_the_image_before_it(missing):
     assert view.scalars == {"link/snr_set_db": 3.0, "drops/all": 1.0, "drops/lost_on_air": 1.0}
 
 
+def test_what_is_not_finite_is_not_plotted(missing):
+    decoded = missing(object())
+    decoded.arrival.snr_db, decoded.arrival.snr_db_set = np.inf, np.nan
+    assert missing_view(decoded, {}).scalars == {"drops/all": 0.0}
+
+
 def test_what_waits_for_the_scene_holds_no_image():
     pose, added = np.eye(4), ((2, 200, np.eye(4)),)
     pixels, ones = np.zeros((48, 64, 3), np.uint8), np.ones((48, 64), np.float32)
