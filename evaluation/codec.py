@@ -44,7 +44,7 @@ from semcast.evaluation.calibration import reliability
 from semcast.evaluation.image_quality import ms_ssim, ssim
 from semcast.evaluation.interruption import until_interrupted
 from semcast.evaluation.picture_strip import write_picture_strip
-from semcast.evaluation.pipeline import UNUSED_LINK_FIELDS
+from semcast.evaluation.pipeline import UNUSED_LINK_FIELDS, check_seeds
 from semcast.evaluation.plots import plot_against_snr
 from semcast.evaluation.report import naming, provenance, short_names, write_result
 from semcast.evaluation.sounding import told_at_first
@@ -105,7 +105,8 @@ class CodecSettings:
         check_snrs(self.snr_db, self.link, _SNRS_DB)
         if not self.codec or len(set(self.codec)) != len(self.codec):
             raise ValueError(f"codec must be one or more different names, got {self.codec}")
-        check_at_least(self, seed=0, max_images=1)
+        check_at_least(self, max_images=1)
+        check_seeds(self.seed)
         check_threads(self.threads)
 
     @property

@@ -31,7 +31,7 @@ from semcast.evaluation.cloud_error import CloudError, TrueView, cloud_error
 from semcast.evaluation.interruption import until_interrupted
 from semcast.evaluation.keyframe_depth import DepthKeyframe, cloud_points, confirmed_depths, reconstructed
 from semcast.evaluation.picture_strip import write_picture_strip
-from semcast.evaluation.pipeline import CLEAN, UNUSED_LINK_FIELDS, run_frames
+from semcast.evaluation.pipeline import CLEAN, UNUSED_LINK_FIELDS, check_seeds, run_frames
 from semcast.evaluation.report import naming, provenance, short_names, write_result
 from semcast.evaluation.scenes.motion import Pace
 from semcast.evaluation.scenes.render import SCENES, RenderSettings, SceneName, render_scene
@@ -106,7 +106,8 @@ class DepthSettings:
             values = getattr(self, name)
             if not values or len(set(values)) != len(values):
                 raise ValueError(f"{name} must be one or more different names, got {values}")
-        check_at_least(self, scene_seed=0, seed=0, seeds=1, stride=1, max_frames=1)
+        check_at_least(self, scene_seed=0, stride=1, max_frames=1)
+        check_seeds(self.seed, self.seeds)
         if not 0 < self.seconds <= 120:
             raise ValueError(f"seconds must be in (0, 120], got {self.seconds:g}")
         check_threads(self.threads)

@@ -51,6 +51,20 @@ UNUSED_IN_ONE_RUN = UNUSED_LINK_FIELDS | {"reconstruction.seed", "reconstruction
 CACHE_BYTES = 2 * 1024**3
 
 
+def check_seeds(seed: int, seeds: int = 1) -> None:
+    """Check that each of ``seeds`` seeds from ``seed`` upwards is one that every evaluation takes.
+
+    Raises:
+        ValueError: One is not, or there is none.
+    """
+    if seed < 0:
+        raise ValueError(f"seed must be at least 0, got {seed}")
+    if seeds < 1:
+        raise ValueError(f"seeds must be at least 1, got {seeds}")
+    if (last := seed + seeds - 1) > MAX_SEED:
+        raise ValueError(f"last of the seeds must be at most {MAX_SEED}, got {last}")
+
+
 @dataclass(frozen=True, kw_only=True)
 class StreamSettings:
     """What every evaluation has in common: which frames travel how.
@@ -85,9 +99,8 @@ class StreamSettings:
     def __post_init__(self) -> None:
         """Check ranges."""
         check_snrs(self.snr_db, self.link)
-        check_at_least(self, seed=0, seeds=1, start=0)
-        if self.all_seeds[-1] > MAX_SEED:
-            raise ValueError(f"last of the seeds must be at most {MAX_SEED}, got {self.all_seeds[-1]}")
+        check_at_least(self, start=0)
+        check_seeds(self.seed, self.seeds)
         check_threads(self.threads)
         check_playback(resize=self.resize, stride=self.stride, max_frames=self.max_frames)
 

@@ -287,6 +287,7 @@ def test_a_damaged_image_is_told_and_left_out(folder, tmp_path, caplog):
         ({"max_images": 0}, "max_images must be at least 1, got 0"),
         ({"threads": 0}, r"threads must be in \[1, 1024\], got 0"),
         ({"seed": -1}, "seed must be at least 0, got -1"),
+        ({"seed": 2**31}, "last of the seeds must be at most 2147483647, got 2147483648"),
     ],
 )
 def test_bad_settings_are_named(tmp_path, values, message):
