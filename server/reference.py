@@ -14,11 +14,11 @@ from semcast.common.camera_settings import CameraSettings
 from semcast.common.errors import SourceError
 from semcast.common.image import psnr_db
 from semcast.common.image_header import stated_size_wh
-from semcast.common.messages import CameraInfo, SourceImage
+from semcast.common.messages import SourceImage
+from semcast.common.recorded_streams import RecordedStream, stream_messages
 from semcast.common.recording_reader import RecordingReader
 from semcast.common.sequence import open_sequence, retimed
 from semcast.common.trajectory import Trajectory
-from semcast.common.wire import WireError, unpack
 
 logger = logging.getLogger(__name__)
 
@@ -111,9 +111,9 @@ def sequence_reference(folder: Path, camera: Intrinsics, given: CameraSettings |
     return Reference(original, sequence.groundtruth(), sequence.times_ns)
 
 
-def recording_reference(reader: RecordingReader, camera: CameraInfo) -> Reference | None:
+def recording_reference(reader: RecordingReader, stream: RecordedStream) -> Reference | None:
     """Compare with the originals an agent shared (``--share-source``); None where the recording has none."""
-    images = _recorded_images(reader, camera)
+    images = _recorded_images(reader, stream)
     newest = next(images, None)
     if newest is None:
         return None
@@ -127,15 +127,11 @@ def recording_reference(reader: RecordingReader, camera: CameraInfo) -> Referenc
     return Reference(original)
 
 
-def _recorded_images(reader: RecordingReader, camera: CameraInfo) -> Iterator[SourceImage]:
+def _recorded_images(reader: RecordingReader, stream: RecordedStream) -> Iterator[SourceImage]:
     """Yield the originals of a stream; what is no valid one is left out."""
-    for message in reader.messages(frozenset({"source"})):
-        try:
-            image = unpack(message.data, SourceImage)
-        except WireError:
-            continue
-        if image.agent_epoch == camera.agent_epoch and image.image_hw == camera.intrinsics.shape_hw:
-            yield image
+    shape_hw = stream.camera.intrinsics.shape_hw
+    messages = stream_messages(reader, stream, {"source": SourceImage})
+    return (image for _, image in messages if image.image_hw == shape_hw)
 
 
 def _pixels(image: SourceImage) -> NDArray[np.uint8]:

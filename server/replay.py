@@ -197,7 +197,7 @@ def _replayed(
     reference = (
         sequence_reference(settings.reference, camera.intrinsics, settings.camera)
         if settings.reference is not None
-        else recording_reference(reader, camera)
+        else recording_reference(reader, stream)
     )
     arrivals = _arrivals(reader, stream, settings)
     # Before a former run is set aside, too.

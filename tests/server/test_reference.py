@@ -11,6 +11,7 @@ from semcast.agent.originals import source_image
 from semcast.agent.source import SourceFrame
 from semcast.common.keys import source_key
 from semcast.common.messages import SourceImage
+from semcast.common.recorded_streams import RecordedStream
 from semcast.common.recorder import Recorder
 from semcast.common.recording_reader import RecordingReader
 from semcast.common.recording_writer import recording_metadata
@@ -19,6 +20,7 @@ from semcast.common.wire import pack
 from semcast.server.reference import Reference, recording_reference, sequence_reference
 
 CAMERA = announced_camera(agent_epoch=5)
+STREAM = RecordedStream("a", CAMERA, num_received=7, num_transmitted=7)
 DEMO = Path(__file__).resolve().parents[2] / "deploy" / "demo" / "kitti_06"
 
 
@@ -75,15 +77,18 @@ def test_only_one_comparison_is_under_way():
     reference.close()
 
 
-def write_originals(path, images):
-    """A recording whose agent shared these frames: id to bytes of the message, or an image."""
+def write_originals(path, images, others=()):
+    """A recording whose agent shared these frames: id to bytes of the message, or an image.
+
+    ``others`` are those of another agent, whose start has the same time.
+    """
     with Recorder(path, recording_metadata("", "0")) as recorder:
-        for frame_id, image in images:
+        for agent_id, (frame_id, image) in (*(("b", k) for k in others), *(("a", k) for k in images)):
             data = image
             if not isinstance(image, bytes):
                 frame = SourceFrame(frame_id=frame_id, t_source_ns=0, t_capture_ns=0, stored=image)
                 data = pack(source_image(frame, CAMERA.agent_epoch, "png"))
-            recorder.put(source_key("a"), "source", data)
+            recorder.put(source_key(agent_id), "source", data)
     return RecordingReader(path)
 
 
@@ -94,7 +99,7 @@ def test_originals_in_a_recording_are_found_by_frame_and_bad_ones_are_left_out(t
     empty = SourceImage(agent_epoch=5, frame_id=4, image_hw=(48, 64), image_format="png", data=b"")
     no_image = SourceImage(agent_epoch=5, frame_id=5, image_hw=(48, 64), image_format="png", data=b"x" * 99)
     messages = [(0, b"junk"), (1, one), (2, other_size), (3, three), (4, pack(empty)), (5, pack(no_image))]
-    reference = recording_reference(write_originals(tmp_path / "r.mcap", messages), CAMERA)
+    reference = recording_reference(write_originals(tmp_path / "r.mcap", messages), STREAM)
     found = [reference.psnr_db(k, one).result(20) for k in range(7)]
     assert found[1] == 100.0
     assert 5.0 < found[3] < 12.0
@@ -102,5 +107,13 @@ def test_originals_in_a_recording_are_found_by_frame_and_bad_ones_are_left_out(t
     reference.close()
 
 
+def test_an_original_of_another_agent_is_not_compared_with(tmp_path):
+    ours, theirs = np.full((48, 64, 3), 200, np.uint8), np.zeros((48, 64, 3), np.uint8)
+    file = write_originals(tmp_path / "r.mcap", [(1, ours)], others=[(1, theirs)])
+    reference = recording_reference(file, STREAM)
+    assert reference.psnr_db(1, ours).result(20) == 100.0
+    reference.close()
+
+
 def test_a_recording_without_originals_has_no_reference(tmp_path):
-    assert recording_reference(write_originals(tmp_path / "r.mcap", [(0, b"junk")]), CAMERA) is None
+    assert recording_reference(write_originals(tmp_path / "r.mcap", [(0, b"junk")]), STREAM) is None
