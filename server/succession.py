@@ -35,8 +35,9 @@ _IN_A_HURRY_S, _STOPPED_S = 2.0, 12.0
 class SuccessiveSessions:
     """Begins the session of each stream, with what is shown of it, and writes what it leaves.
 
-    Files that can't be written, and a stream after the first that can't be shown or compared with its
-    reference, are reported and nothing ends. Used from one thread.
+    Files that can't be written on the way are reported and nothing ends. Nor does anything where the folder of
+    a stream can't be used, or it can't be shown or compared with its reference; but for the first stream of a
+    server that does not keep running, which says so at once. Used from one thread.
 
     Args:
         settings: Of the server.
@@ -79,9 +80,17 @@ class SuccessiveSessions:
         self._spare_bundle: BundleRunner | None = new_bundle(settings, metrics.error)
 
     def begin(self, camera: CameraInfo) -> Session:
-        """Begin on a stream, ending the one before."""
+        """Begin on a stream, ending the one before.
+
+        Raises:
+            ConfigError: It can't be shown.
+            SourceError: The reference can't be read.
+            OSError: The folder for outputs can't be made.
+            SemcastError: It can't be written into.
+        """
         identity = StreamIdentity.of(self._settings.agent_id, camera)
         former, self.current = self.current, None
+        goes_on = former is not None or self._settings.keep_running
         if former is not None:
             is_restart = former.identity.agent_epoch != identity.agent_epoch
             logger.info("%sa new map is begun", "the agent was started again: " if is_restart else "")
@@ -93,11 +102,11 @@ class SuccessiveSessions:
         if former is not None and former.identity.camera != identity.camera:
             self._close_reference()
         if self._reference is None:
-            self._reference = self._new_reference(identity, goes_on=former is not None)
-        self.current = self._new_session(identity, goes_on=former is not None)
+            self._reference = self._new_reference(identity, goes_on=goes_on)
+        self.current = self._new_session(identity, goes_on=goes_on)
         self._former_starts.begin(identity.agent_epoch)
         self._drops_before = self._metrics.drops if former is not None else {}
-        self._show(identity, self.current.resumed, goes_on=former is not None)
+        self._show(identity, self.current.resumed, goes_on=goes_on)
         logger.info(
             "stream of %s (%s): %dx%d, codec %s, %s mode",
             *(identity.agent_id, camera.source_name, *camera.image_wh, camera.codec, self._settings.mode),

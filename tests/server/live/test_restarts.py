@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from semcast.common.errors import ConfigError
+from semcast.common.errors import ConfigError, SemcastError
 from semcast.common.recorded_streams import recorded_streams
 from semcast.common.recording_reader import RecordingReader
 from semcast.common.run_folder import read_run
@@ -249,6 +249,28 @@ def test_a_new_start_that_cannot_be_written_is_kept_in_memory(tmp_path, air, cap
     assert "frames.jsonl can't be written" in caplog.text
     assert json.loads((tmp_path / "summary.json").read_text())["frames"]["tracked"] == 4
     assert not (tmp_path / "frames.jsonl").exists()
+
+
+def test_a_first_stream_that_cannot_be_begun_on_as_asked_does_not_end_a_server_that_keeps_running(
+    tmp_path, air, caplog
+):
+    out, reference = tmp_path / "out", shutil.copytree(DEMO, tmp_path / "reference")
+    view = ViewSettings(view="file")
+    running = air.serve(out=out, reference=reference, view=view, keep_running=True)
+    shutil.rmtree(reference)
+    out.rmdir()
+    out.write_text("in the way")
+    agent = air.agent(100)
+    agent.stream(range(4))
+    for told in (
+        "the new stream has no PSNR and no true path: no sequence at",
+        f"outputs can't be written to {out}",
+        f"the new stream is not shown: {out / 'run.rrd'} can't be written",
+    ):
+        assert told in caplog.text
+    with pytest.raises(SemcastError, match="outputs can't be written"):
+        running.finish(stop=True)
+    assert running.server.metrics.counts["tracked"] == 4
 
 
 def test_a_late_frame_of_the_former_start_does_not_end_the_new_one(tmp_path, air):
