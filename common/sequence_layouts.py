@@ -204,7 +204,8 @@ def _check_there(path: Path) -> None:
                 f"a sequence must be a folder or a transforms .json file, got the file {path}: {way}"
             )
     elif not path.is_dir():
-        raise SourceError(f"no sequence at {path}: there is no such file or folder")
+        what = "that is a pipe, socket or device" if path.exists() else "there is no such file or folder"
+        raise SourceError(f"no sequence at {path}: {what}")
 
 
 def images_in(folder: Path) -> tuple[Path, ...]:

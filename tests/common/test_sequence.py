@@ -1,4 +1,5 @@
 import json
+import os
 
 import cv2
 import numpy as np
@@ -279,6 +280,11 @@ def damage_order(folder):
     return folder
 
 
+def damage_pipe(folder):
+    os.mkfifo(folder / "pipe")
+    return folder / "pipe"
+
+
 def damage_truth(folder):
     lines = (folder / "groundtruth.txt").read_text().splitlines()
     (folder / "groundtruth.txt").write_text("\n".join([*lines[:3], "0.25 nan 0 0 0 0 0 1"]))
@@ -294,6 +300,7 @@ def damage_number(folder):
     ("damage", "message"),
     [
         (damage_missing, "there is no such file or folder"),
+        (damage_pipe, "no sequence at .*pipe: that is a pipe, socket or device"),
         (damage_empty, "expected images/ .native."),
         (damage_size, "intrinsics of walk are for 64x48 images, its images are 32x24: if they are the same"),
         (damage_all_images, "000000.png is not a readable image"),
