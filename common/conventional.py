@@ -14,6 +14,7 @@ frame that passes its CRC has none.
 """
 
 import hashlib
+import logging
 from typing import NamedTuple
 
 import cv2
@@ -42,6 +43,8 @@ from semcast.common.phy.hashing import hash_words, hashed_qpsk
 from semcast.common.phy.qam import indices_to_symbols
 from semcast.common.phy.slots import SlotLayout, layout_for
 from semcast.common.shapes import check_shape
+
+logger = logging.getLogger(__name__)
 
 #: No link is better; what is said to be is finite this way.
 _MAX_SNR_DB = 100.0
@@ -151,6 +154,7 @@ class ConventionalCodec:
         self._slow = slow
         self.modulation: Modulation = "analog" if adaptive else modulation
         self._quality_hint = 30
+        self._told_of_no_room = False
         self._layout: SlotLayout | None = None
         self._transports: dict[int, Transport | None] = {}
 
@@ -166,7 +170,7 @@ class ConventionalCodec:
         return hashlib.sha256(agreed.encode()).hexdigest()[:16]
 
     def encode(self, image: NDArray[np.uint8], snr_db: float) -> EncodedImage:
-        """Encode one image; an image too small for any file is sent as an empty payload.
+        """Encode one image; one too small for any file is sent empty, an outage, which is warned of once.
 
         Args:
             image: ``(H, W, 3)`` uint8 RGB.
@@ -183,9 +187,13 @@ class ConventionalCodec:
         mode_idx = self._choose_mode(layout, snr_db)
         transport = self._transport(layout, mode_idx)
         if transport is None:
+            self._tell_of_no_room(shape_hw, 0)
             symbols = self._filler(layout)
         else:
-            symbols = transport.encode(self._payload(image, transport.capacity_bytes))
+            payload = self._payload(image, transport.capacity_bytes)
+            if not payload:
+                self._tell_of_no_room(shape_hw, transport.capacity_bytes)
+            symbols = transport.encode(payload)
         header = self._header_per_slot(layout)
         data = np.empty((layout.num_slots, layout.data_per_slot), dtype=np.complex64)
         if header:
@@ -225,6 +233,16 @@ class ConventionalCodec:
         self._quality_hint, data = found
         decoded = decompress(data, (image.shape[0], image.shape[1]))
         return b"" if decoded is None else _confidence_table(image, decoded) + data
+
+    def _tell_of_no_room(self, shape_hw: tuple[int, int], capacity_bytes: int) -> None:
+        """Say once that frames are sent empty: at the receiver that looks like a link that is too poor."""
+        if not self._told_of_no_room:
+            logger.warning(
+                "%s: a frame of %dx%d pixels carries %d bytes, too few for any file of the image, so it "
+                "is sent empty; larger images, a higher --rate or a learned codec get through",
+                *(self.name, shape_hw[1], shape_hw[0], capacity_bytes),
+            )
+        self._told_of_no_room = True
 
     def _receive(self, received: ReceivedImage) -> bytes | None:
         layout = layout_for(received.shape_hw)

@@ -1,3 +1,5 @@
+import re
+
 import cv2
 import numpy as np
 import pytest
@@ -261,3 +263,25 @@ def test_bad_images_are_named():
         codec.encode(np.zeros((4, 4), np.uint8), 10.0)
     with pytest.raises(ValueError, match="image must be uint8, got float64"):
         codec.encode(np.zeros((16, 16, 3)), 10.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "shape_hw", "capacity"),
+    [("jpeg-ldpc", (48, 160), "[1-9][0-9]*"), ("jpeg-amc", (10, 32), "0")],
+)
+def test_images_for_which_no_file_is_small_enough_are_said_to_be_sent_empty_once(
+    name, shape_hw, capacity, caplog
+):
+    codec = load_codec(name)
+    image = np.random.default_rng(0).integers(0, 256, (*shape_hw, 3), dtype=np.uint8)
+    assert through(codec, image, 0.0).outage
+    assert through(codec, image, 0.0).outage
+    height, width = shape_hw
+    (record,) = caplog.records
+    message = rf"{name}: a frame of {width}x{height} pixels carries {capacity} bytes, too few for any file"
+    assert re.match(message, record.getMessage())
+
+
+def test_images_that_fit_are_warned_of_nothing(picture, caplog):
+    through(load_codec("jpeg-ldpc"), picture, 30.0)
+    assert not caplog.records
