@@ -209,14 +209,16 @@ def _check_there(path: Path) -> None:
 
 
 def images_in(folder: Path) -> tuple[Path, ...]:
-    """Return the image files of a folder in the natural order of their names.
+    """Return the image files of a folder in the natural order of their names; nothing is read from a pipe.
 
     Raises:
         SourceError: The folder can't be read.
     """
     try:
         found = [
-            p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")
+            p
+            for p in folder.iterdir()
+            if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".") and not p.is_fifo()
         ]
     except OSError as err:
         raise SourceError(f"{folder} can't be read: {err}") from err

@@ -225,13 +225,23 @@ class Receiver:
             return
         if frame.lossless != (self._mode == "replay"):
             self._metrics.drop("mode")
-            there = "replay" if frame.lossless else "live"
-            self._complaints.tell(
-                "mode", f"the agent runs in {there} mode, this server in {self._mode}: give both one --mode"
-            )
+            self._tell_of_mode(frame.lossless)
         else:
             self._sort(frame, arrival_ns)
         self._metrics.count("received")
+
+    def takes(self, camera: CameraInfo) -> bool:
+        """Tell whether frames of a stream that is announced will count; say why where they will not."""
+        if camera.lossless != (self._mode == "replay"):
+            self._tell_of_mode(camera.lossless)
+            return False
+        return True
+
+    def _tell_of_mode(self, lossless: bool) -> None:
+        there = "replay" if lossless else "live"
+        self._complaints.tell(
+            "mode", f"the agent runs in {there} mode, this server in {self._mode}: give both one --mode"
+        )
 
     def _sort(self, frame: SymbolFrame, arrival_ns: int) -> None:
         with self._lock:

@@ -206,6 +206,8 @@ class Server:
         camera, session = self._announced.take(), self._sessions.current
         if camera is None or (session is not None and camera.agent_epoch <= session.identity.agent_epoch):
             return False
+        if not self._receiver.takes(camera):
+            return False  # nor is it told that all is ready: it would wait without a word
         self._sessions.begin(camera)
         width, height = camera.image_wh
         try:

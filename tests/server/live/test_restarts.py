@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from waiting import until
 
 from semcast.common.errors import ConfigError, SemcastError
 from semcast.common.recorded_streams import recorded_streams
@@ -352,3 +353,17 @@ def test_an_announcement_that_no_agent_stands_by_does_not_end_a_map(air):
     radio._announce.put(pack(replace(radio.camera, agent_epoch=2**62)))
     radio.stream(range(4, 8))
     assert running.finish(stop=True)["frames"]["tracked"] == 8
+
+
+@pytest.mark.parametrize("mode", ["live", "replay"])
+def test_an_agent_of_the_other_mode_ends_no_map_and_is_told_of(air, mode, caplog):
+    running = air.serve(mode=mode)
+    radio = air.agent(100, lossless=mode == "replay")
+    radio.stream(range(6))
+    other = air.agent(200, lossless=mode == "live")
+    until(lambda: "give both one --mode" in caplog.text, "a word on the modes")
+    radio.stream(range(6, 12))
+    radio.wait(lambda: 11 in radio.posed_ids(), "an answer to frame 11")
+    assert other.allowed == 0, "nobody is ready for it"
+    summary = running.finish(stop=True)
+    assert summary["frames"]["tracked"] == 12
