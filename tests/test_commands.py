@@ -322,7 +322,13 @@ def test_doctor_tells_by_its_exit_code_whether_required_roles_are_alive(capsys, 
         assert "must be some of agent,channel,server, got 'server,camera'" in capsys.readouterr().err
 
 
-def test_doctor_names_the_agents_that_go_by_another_name():
+@pytest.fixture
+def quick_beats(monkeypatch):
+    """Let roles tell ten times a second of themselves, and be waited for as much shorter."""
+    monkeypatch.setattr("semcast.common.status_beat.STATUS_INTERVAL_S", 0.1)
+
+
+def test_doctor_names_the_agents_that_go_by_another_name(quick_beats):
     hub, endpoint = open_hub()
     with hub:
         hub.declare_alive("cam1", "agent")
@@ -339,7 +345,7 @@ def test_doctor_names_the_agents_that_go_by_another_name():
         assert len(list(check_system(endpoint, "cam0"))) == 3, "who finds all roles asked for the right one"
 
 
-def test_doctor_tells_what_a_running_system_says_of_itself():
+def test_doctor_tells_what_a_running_system_says_of_itself(quick_beats):
     hub, endpoint = open_hub()
     metrics = Metrics("agent")
     for _ in range(40):

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-import scipy.stats
+import scipy  # its parts are loaded where they are used: statistics take seconds
 
 from semcast.evaluation.statistics import (
     auroc,
