@@ -59,8 +59,9 @@ def test_the_line_of_the_snr_that_is_set_has_no_gap_where_a_report_came_late(tmp
     whole = [row(k) for k in range(10)]
     late = [row(k, snr_set_db=None if k in (3, 6) else 10.0) for k in range(10)]
     unlike = [row(k, snr_set_db=8.0 if k in (3, 6) else 10.0) for k in range(10)]
-    assert (timeline(late, tmp_path, "late") == timeline(whole, tmp_path, "whole")).all()
-    assert (timeline(unlike, tmp_path, "unlike") != timeline(whole, tmp_path, "whole")).any()
+    of_whole = timeline(whole, tmp_path, "whole")
+    assert (timeline(late, tmp_path, "late") == of_whole).all()
+    assert (timeline(unlike, tmp_path, "unlike") != of_whole).any()
 
 
 def test_missing_frames_lie_between_those_that_are_there():

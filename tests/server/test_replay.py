@@ -42,7 +42,7 @@ from semcast.server.session import Session
 from semcast.server.view.settings import ViewSettings
 
 SEQUENCE = Path(__file__).resolve().parents[2] / "deploy" / "demo" / "kitti_06"
-FRAMES = 14
+FRAMES = 10
 
 
 @pytest.fixture(scope="module")
@@ -174,17 +174,20 @@ def test_two_replays_give_the_same_files_and_another_channel_does_not(recording,
     seen = []
     for name in ("a", "b"):
         summary = replay(
-            ReplaySettings(file=recording, out=tmp_path / name, reference=SEQUENCE), None, seen.append
+            ReplaySettings(file=recording, out=tmp_path / name, reference=SEQUENCE, end_s=0.85),
+            None,
+            seen.append,
         )
         assert summary["completeness"] > 0.4
         assert summary["stage_ms"]["equalise"]["p50"] > 0.0
-    assert seen == 2 * list(range(FRAMES))
+    assert seen == 2 * list(range(9))
     first, second = ((tmp_path / name / "trajectory.tum").read_bytes() for name in ("a", "b"))
     assert first == second
     clouds = [(tmp_path / name / "dense.ply").read_bytes() for name in ("a", "b")]
     assert clouds[0] == clouds[1]
     assert len(clouds[0]) > 10_000
-    lossy = without_depth(recording, out=tmp_path / "c", link=ChannelSettings(snr_db=15.0, frame_loss=0.4))
+    link = ChannelSettings(snr_db=15.0, frame_loss=0.4)
+    lossy = without_depth(recording, out=tmp_path / "c", link=link, end_s=0.85)
     assert replay(lossy)["stage_ms"]["equalise"]["p50"] > 0.0
     assert (tmp_path / "c" / "trajectory.tum").read_bytes() != first
     assert build_settings(ReplaySettings, read_toml(tmp_path / "c" / "settings.toml")) == lossy
@@ -456,7 +459,7 @@ def test_info_lists_the_streams_of_a_recording(with_a_later_start):
 
 
 def test_a_time_range_without_frames_is_one_clear_error(recording, tmp_path):
-    long = r"it is 1\.[0-9] s long"
+    long = r"it is 0\.9 s long"
     replay(without_depth(recording, end_s=0.3, out=tmp_path / "run"))
     with pytest.raises(SourceError, match=f"no frame of .*run.mcap lies after 100 s: {long}"):
         replay(without_depth(recording, start_s=100.0, out=tmp_path / "run"))
