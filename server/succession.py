@@ -36,8 +36,8 @@ class SuccessiveSessions:
     """Begins the session of each stream, with what is shown of it, and writes what it leaves.
 
     Files that can't be written on the way are reported and nothing ends. Nor does anything where a stream's
-    folder can't be used, or it can't be shown or compared with its reference; but the first stream of a server
-    that does not keep running says so at once. Used from one thread.
+    folder can't be used, or it can't be shown or compared with its reference; but the first stream of a
+    server that does not keep running says so at once. Used from one thread.
 
     Args:
         settings: Of the server.

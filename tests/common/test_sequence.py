@@ -185,6 +185,12 @@ def test_a_video_is_sent_to_where_videos_go(tmp_path, layout):
         open_sequence(tmp_path / "run.mcap", layout=layout)
 
 
+def test_a_pipe_among_images_is_no_image(tmp_path, write_images):
+    write_images(tmp_path, 3)
+    os.mkfifo(tmp_path / "000001b.png")
+    assert len(open_sequence(tmp_path)) == 3
+
+
 def test_a_folder_of_images_needs_a_camera_only_when_it_is_asked_for_one(tmp_path, write_images):
     write_images(tmp_path, 3, "img{:d}.jpg")
     sequence = open_sequence(tmp_path, rate_hz=5.0)
