@@ -232,7 +232,6 @@ def test_a_folder_with_images_no_run_wrote_is_no_place_for_outputs(tmp_path):
     assert sorted(p.name for p in sequence.rglob("*")) == before
 
 
-@pytest.mark.slow
 def test_three_processes_turn_a_sequence_into_a_trajectory(tmp_path):
     told, rows = [], []
     recording = tmp_path / "run.mcap"

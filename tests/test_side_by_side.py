@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 import torch
 
 from semcast.common.nets.codec import NeuralCodec
@@ -24,6 +25,7 @@ def test_where(k, request):
 """
 
 
+@pytest.mark.slow
 def test_a_file_is_in_one_process_and_all_that_need_the_clock_are_in_one(tmp_path):
     mark = 'pytestmark = pytest.mark.xdist_group("real-time")'
     (tmp_path / "conftest.py").write_text((ROOT / "tests/conftest.py").read_text(encoding="utf-8"))

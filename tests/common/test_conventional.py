@@ -87,7 +87,7 @@ def test_the_adaptive_codec_works_where_the_fixed_one_fails_and_is_better_above(
     assert better > psnr_db(through(fixed, picture, 13.0).image, picture) + 0.5
 
 
-@pytest.mark.parametrize("snr_db", [10.0, 20.0])
+@pytest.mark.parametrize("snr_db", [pytest.param(10.0, marks=pytest.mark.slow), 20.0])
 def test_lost_slots_leave_the_adaptive_codec_few_outages(snr_db, picture):
     """What a strong link has in excess in some slots can't make up for those that are lost."""
     codec, image = load_codec("jpeg-amc"), np.vstack([picture] * 3)

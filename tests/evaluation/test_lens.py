@@ -188,6 +188,7 @@ def test_a_lens_changes_what_is_known_of_a_camera():
     assert Lens(1.0, (-0.05, 0.0)).put_on(bent).distortion == pytest.approx((0.05, 0.2, 0.001, 0.002, 0.3))
 
 
+@pytest.mark.slow
 def test_the_lens_of_a_drawn_room_is_found_and_written(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(moving_images, "_MAX_PIXELS", 320 * 240)
     monkeypatch.setattr(render, "_SAMPLES", ((0.0, 0.0),))  # a fourth of the time to draw it

@@ -27,8 +27,10 @@ def forgotten():
     """Let scenes go when they were all looked at: each holds a hundred megabytes."""
     yield
     painted.cache_clear()
+    seen.cache_clear()
 
 
+@functools.cache
 def seen(distortion, readout_s=0.0, name="room", model="radtan"):
     scene = copy.copy(painted(name))
     scene.camera = replace(scene.camera, distortion=distortion, distortion_model=model)

@@ -408,7 +408,6 @@ for (name, steps, stopped_rank), port in zip(runs, sys.argv[3:], strict=True):
 """
 
 
-@pytest.mark.slow
 def test_two_processes_train_one_model_and_stop_together_when_one_is_told_to(photos, tmp_path):
     with contextlib.ExitStack() as held:
         free = [held.enter_context(socket.socket()) for _ in range(3)]

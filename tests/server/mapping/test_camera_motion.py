@@ -129,7 +129,7 @@ def test_less_than_the_error_of_poses_is_no_stop():
     assert go(CameraMotion(CAMERA), 0.01 * np.array([0, 1, 2, 3, 3, 3, 6, 7])) == {}
 
 
-@pytest.mark.parametrize(("num_hung", "parts"), [(4, 1), (10, 2)])
+@pytest.mark.parametrize(("num_hung", "parts"), [pytest.param(4, 1, marks=pytest.mark.slow), (10, 2)])
 def test_a_road_is_driven_past_a_grabber_that_hangs(num_hung, parts, caplog):
     """After a second nothing is left in sight, and a new part of the map begins."""
     sequence = open_sequence(STREET)

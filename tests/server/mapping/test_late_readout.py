@@ -61,7 +61,10 @@ def run(readout_s, axis=0, **settings):
     return reconstruction, trajectory, ate_percent(trajectory, truth)
 
 
-@pytest.mark.parametrize(("readout_s", "axis", "side"), [(READOUT_S, 0, "top"), (-READOUT_S, 1, "right")])
+@pytest.mark.parametrize(
+    ("readout_s", "axis", "side"),
+    [(READOUT_S, 0, "top"), pytest.param(-READOUT_S, 1, "right", marks=pytest.mark.slow)],
+)
 def test_the_readout_is_found_and_the_path_is_put_right(readout_s, axis, side, caplog):
     with caplog.at_level(logging.INFO, "semcast.server.mapping"):
         reconstruction, trajectory, ate = run(readout_s, axis)

@@ -58,7 +58,7 @@ def image_at(k, step_px):
     return np.repeat(image[..., None], 3, axis=2)
 
 
-@pytest.mark.parametrize("step_px", [2, 4])
+@pytest.mark.parametrize("step_px", [2, pytest.param(4, marks=pytest.mark.slow)])
 def test_something_large_that_passes_through_does_not_take_the_camera_along(step_px):
     reconstruction = Reconstruction(CAMERA, ReconstructionSettings(max_features=250), InlineBundle())
     for k in range(NUM_FRAMES):

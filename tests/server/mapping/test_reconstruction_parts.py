@@ -70,6 +70,7 @@ def test_what_passes_before_a_camera_at_rest_begins_no_map():
     assert ate_percent(core.final_trajectory(), truth) < 0.5
 
 
+@pytest.mark.slow
 def test_the_unit_of_a_new_part_is_told_by_its_start_alone(monkeypatch):
     """Before the start the camera only turned: over that time it was not as fast as before and after."""
     starts = []
@@ -190,6 +191,7 @@ def test_a_place_where_the_camera_cannot_be_joins_nothing(caplog, monkeypatch):
         assert more["depth"] > 0.0
 
 
+@pytest.mark.slow
 def test_a_join_leaves_the_older_part_where_it_is(caplog):
     # Back from a second part the camera is recognised in the first one, and comes into sight of the second.
     def at(x, k):
@@ -258,6 +260,7 @@ def test_a_turn_that_leaves_all_landmarks_behind_is_part_of_the_map():
     assert ate_percent(reconstruction.final_trajectory(), truth) < 1.0
 
 
+@pytest.mark.slow
 def test_a_part_begun_after_a_turn_is_not_taken_for_the_old_one(caplog, monkeypatch):
     # Many tracks survive the turn, but no landmark does, nor do points under small angles replace them.
     monkeypatch.setattr("semcast.server.mapping.map_builder._ENOUGH_SHARE", 0.0)
@@ -291,6 +294,7 @@ def made_bad(image, rng):
     return np.clip(cv2.GaussianBlur(image, None, 10.0) + noise, 0, 255).astype(np.uint8)
 
 
+@pytest.mark.slow
 def test_a_part_after_a_turn_in_bad_images_begins_as_they_say_and_gets_its_unit_after_a_second(monkeypatch):
     """No point can be followed while the camera turns; a start makes the part too large."""
     lay, rng = SubmapPlacement.place, np.random.default_rng(0)
@@ -313,7 +317,7 @@ def test_a_part_after_a_turn_in_bad_images_begins_as_they_say_and_gets_its_unit_
     assert after == pytest.approx(before, rel=0.2)
 
 
-@pytest.mark.parametrize("seed", [0, 4, 10])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (4, 10))])
 def test_noise_tells_no_pose_and_begins_no_part(seed):
     core, rng = make(lost_after_s=0.05), np.random.default_rng(seed)
     for k, image in enumerate(turn_in_bad_images(26)[1]):

@@ -31,6 +31,7 @@ def behind_a_gap(sequence, num_missing):
     return results[NUM_BEFORE + num_missing], poses
 
 
+@pytest.mark.slow
 def test_what_klt_finds_by_chance_is_no_pose(orbit):
     """35 degrees on, next to nothing looks as it did, yet KLT finds something near where the motion leads."""
     first, poses = behind_a_gap(orbit, 10)

@@ -103,7 +103,8 @@ def windows(seed, size, interval, num_points):
     ("size", "interval", "num_points"),
     [
         pytest.param(12, 4, 40, id="keyframes in three windows"),  # as three witnesses: .80
-        pytest.param(5, 2, 30, id="four tenths of the variance in unknowns"),  # by residuals as they are: .92
+        # By residuals as they are: .92.
+        pytest.param(5, 2, 30, id="four tenths of the variance in unknowns", marks=pytest.mark.slow),
     ],
 )
 def test_a_readout_is_as_sure_as_the_watch_says(size, interval, num_points):

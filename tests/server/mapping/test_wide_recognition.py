@@ -55,7 +55,7 @@ def find(mapped, sight, recogniser=None):
     return recogniser.find(sight, reconstruction.world, reconstruction._map.images, NOISE)
 
 
-@pytest.mark.parametrize("num_lost_rows", [0, 160])
+@pytest.mark.parametrize("num_lost_rows", [pytest.param(0, marks=pytest.mark.slow), 160])
 def test_the_place_is_found_from_20_degrees_on(mapped, num_lost_rows):
     sequence, reconstruction = mapped
     k = NUM_MAPPED + 5
