@@ -128,6 +128,10 @@ class ConstantVelocity:
         """Translation ``(3,)`` in the camera's own frame that goes on for so long."""
         return elapsed_s * self._way_per_s()
 
+    def turn_in(self, elapsed_s: float) -> Array:
+        """Rotation ``R_now_then (3, 3)`` of a camera that goes on turning as it did for so long."""
+        return exp_so3(elapsed_s * self._rotation_rad_per_s)
+
     def whereabouts(self, t_source_ns: int, depth: float) -> Whereabouts | None:
         """Where the camera can be at a time, with the scene at a depth in map units.
 

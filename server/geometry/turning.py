@@ -38,7 +38,9 @@ _LEAST_SD_GREY = 0.3
 _LEAST_GREY_PER_RAD = 5.0
 
 
-def turn_between(camera: Intrinsics, grey0: Grey, grey1: Grey, way_depths: Array) -> Array | None:
+def turn_between(
+    camera: Intrinsics, grey0: Grey, grey1: Grey, way_depths: Array, R_expected: Array | None = None
+) -> Array | None:
     """Estimate a rotation by aligning two whole images, another brightness allowed.
 
     Args:
@@ -47,17 +49,21 @@ def turn_between(camera: Intrinsics, grey0: Grey, grey1: Grey, way_depths: Array
         grey1: ``(H, W)`` second image.
         way_depths: ``(3,)`` where the second camera is in the frame of the first, over how far things are:
             what moving does to the image is no turn.
+        R_expected: ``R_cam1_cam0 (3, 3)`` from which the search begins as well as from no turn: what goes
+            further than a tenth of the image is out of its reach.
 
     Returns:
         ``R_cam1_cam0 (3, 3)``. None where the images have too little in common, or nothing in them tells.
     """
-    R_cam1_cam0 = np.eye(3)
+    starts = [np.eye(3)] if R_expected is None else [np.eye(3), R_expected]
     for width_px in _WIDTHS_PX:
-        aligned = _aligned(camera, _small(grey0, width_px), _small(grey1, width_px), way_depths, R_cam1_cam0)
+        small0, small1 = _small(grey0, width_px), _small(grey1, width_px)
+        found = [_aligned(camera, small0, small1, way_depths, R) for R in starts]
+        aligned = max((a for a in found if a is not None), key=lambda a: a[1], default=None)
         if aligned is None:
             return None
-        R_cam1_cam0, correlation = aligned
-    return R_cam1_cam0 if correlation > _MIN_CORRELATION else None
+        starts = [aligned[0]]
+    return aligned[0] if aligned[1] > _MIN_CORRELATION else None
 
 
 def _aligned(

@@ -73,7 +73,8 @@ Getting lost, and places seen again
     visual_gyroscope  how a camera without a pose turns
     bridging          where a new submap begins and its unit, told by how the camera moved
     guessed_place     how far off that may be, for every pose there until the submap is joined
-    submap_placement  puts it there, and again once it has settled
+    submap_placement  puts it there, and again once it has settled, or the camera is back from it
+    known_end         where it is, by the guess of its beginning and by where it ended
     joining           whether the camera can have got to where a place joins two submaps
     revisit           old landmarks that are in sight again get their tracks back
     loop_closure      finds loops and shares out the drift

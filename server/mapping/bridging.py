@@ -81,16 +81,20 @@ def bridge(
     elapsed_s = (last.t_source_ns - first.t_source_ns) * 1e-9
     since_s = (first.t_source_ns - last_ns) * 1e-9
     speed, speed_sigma = motion.speed_at(first.t_source_ns)
-    by_depth = Bridge(T_world_guess, depth, None)
     gone = speed * elapsed_s
-    if since_s >= _MAX_BRIDGE_S or way <= 0.0 or gone <= _LEAST_WAY * depth:
-        return by_depth
-    if not depth / _MOST_FARTHER < gone / way < _MOST_FARTHER * depth:
-        return by_depth
-    error = _SPEED_ERROR_DEPTHS_S * depth / speed
-    weights = _DEPTH_SIGMA**-2, 1.0 / (_SPEED_SIGMA**2 + error**2 + speed_sigma**2)
-    scale = float(np.exp(np.average(np.log((depth, gone / way)), weights=weights)))
     turned = [then for then in turned if then[0] <= at_ns]
+    scale, weight = depth, _DEPTH_SIGMA**-2
+    if (
+        since_s < _MAX_BRIDGE_S
+        and gone > _LEAST_WAY * depth
+        and depth / _MOST_FARTHER < gone / max(way, 1e-300) < _MOST_FARTHER * depth
+    ):
+        error = _SPEED_ERROR_DEPTHS_S * depth / speed
+        weights = weight, 1.0 / (_SPEED_SIGMA**2 + error**2 + speed_sigma**2)
+        scale = float(np.exp(np.average(np.log((depth, gone / way)), weights=weights)))
+        weight = sum(weights)
+    elif not turned or turned[-1][0] != at_ns:
+        return Bridge(T_world_guess, depth, None)
     # Of a source that gives two images one time, the second tells no speed.
     later = [k for k in grown.keyframes if k.t_source_ns > at_ns]
     soon = ([k for k in later if k.t_source_ns - at_ns <= _LATER_NS] or later[:1])[-1]
@@ -110,4 +114,4 @@ def bridge(
     by_scale[3:6] = T_world_first[:3, :3].T @ (T_world_first[:3, 3] - T_world_short[:3, 3])
     by_scale[6] = 1.0
     covariance = np.diag(np.repeat((*variances, 0.0), (3, 3, 1)))
-    return Bridge(T_world_first, scale, covariance + np.outer(by_scale, by_scale) / sum(weights))
+    return Bridge(T_world_first, scale, covariance + np.outer(by_scale, by_scale) / weight)

@@ -103,6 +103,10 @@ class CameraMotion:
         """Translation ``(3,)`` in the camera's frame that goes on for so long; none while it stands."""
         return np.zeros(3) if self._still else self._motion.way_in(elapsed_s)
 
+    def turn_in(self, elapsed_s: float) -> Array:
+        """Rotation ``(3, 3)`` in the camera's frame that goes on for so long; none while it stands."""
+        return np.eye(3) if self._still else self._motion.turn_in(elapsed_s)
+
     def bridge(
         self, t_source_ns: int, T_after_later: Array, later_s: float, turned: Sequence[tuple[int, Array]] = ()
     ) -> Array | None:

@@ -428,12 +428,13 @@ class MapBuilder:
     def place_again(self, placement: SubmapPlacement) -> float:
         """Move the current submap to where it is by now known to begin; the factor on lengths, else 1."""
         found = placement.place_again(self.world, self.submap)
-        if found is None:
-            return 1.0
-        scale, T_new_old, guess = found
+        return 1.0 if found is None else self.move_guessed(self.submap, *found)
+
+    def move_guessed(self, submap: int, scale: float, T_new_old: Array, guess: GuessedPlace) -> float:
+        """Move a submap by a similarity to where it is now guessed to be; returns the factor on lengths."""
         self._abandon_adjustment()
-        self.world.transform_submap(self.submap, self.submap, scale, T_new_old)
-        self.world.guesses[self.submap] = guess
+        self.world.transform_submap(submap, submap, scale, T_new_old)
+        self.world.guesses[submap] = guess
         self._adjusted = None
         self._on_moved(scale)
         return scale

@@ -312,12 +312,25 @@ class Reconstruction:
             return None
         # Nothing is given up for a place before there is a pose in it.
         if (pose := self._locator.pose_at(place)) is not None:
-            if whereabouts is None or place.submap != self._map.world.keyframes[-1].submap:
+            newest = self._map.world.keyframes[-1].submap
+            if place.submap < newest:
+                self._settle(newest, sight, pose.T_world_cam)
+            if whereabouts is None or place.submap != newest:
                 self._motion.reset()
             self._map.go_on_from(place)
             self._tracks.adopt(place.ids, place.xy, RECOGNISED_CONFIDENCE)
             self._initialiser.clear()
         return pose
+
+    def _settle(self, submap: int, sight: Sight, T_world_cam: Array) -> None:
+        """Put the newest submap where it is, now that the camera is back from it at a known pose."""
+        self._map.finish()
+        found = self._placement.come_back(sight, T_world_cam, self._motion, self._map.world)
+        if found is not None:
+            logger.info(
+                "frame %d: back in an older part, the newest one is put between", sight.frame.frame_id
+            )
+            self._map.move_guessed(submap, *found)
 
     def _begin_map(self, sight: Sight, start: Start) -> FrameResult:
         """Bring a start into the map and pose the frames that waited for it."""

@@ -1,8 +1,9 @@
-"""Places a new submap after a gap, and again once its scale has settled.
+"""Places a new submap after a gap, again once its scale has settled, and when the camera is back from it.
 
 Its pose and scale come from the camera's motion before and after the gap and its rotation meanwhile, see
 ``bridging``. The views of a start are close to each other, and the first adjustments change its scale; so the
-submap is placed once more after a second, by the camera's path in that second.
+submap is placed once more after a second, by the camera's path in that second. An older part that is in sight
+again tells where the camera was in the end, see ``known_end``.
 """
 
 from copy import deepcopy
@@ -12,11 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.common.geometry import invert_transform
+from semcast.common.geometry import invert_transform, make_transform, rotation_angle_deg
 from semcast.server.mapping.bridging import Bridge, bridge
 from semcast.server.mapping.camera_motion import CameraMotion
 from semcast.server.mapping.guessed_place import GuessedPlace
 from semcast.server.mapping.initialiser import Start
+from semcast.server.mapping.known_end import place_by_end
 from semcast.server.mapping.scene_depth import median_depth, usual_depth
 from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.visual_gyroscope import VisualGyroscope
@@ -28,6 +30,8 @@ Array = NDArray[np.float64]
 _SETTLED_NS = 1_000_000_000
 #: but not later than this: a camera that stood since, or was elsewhere, has not gone on as before.
 _LATEST_NS = 2_000_000_000
+#: How far off it may be how the camera turned while it had no pose: radians, and share of the turn.
+_TURN_SIGMA = (0.01, 0.03)
 
 
 @dataclass(frozen=True)
@@ -124,11 +128,59 @@ class SubmapPlacement:
         start = Start([k for k in keyframes if k.t_source_ns >= before.start_ns], *none)
         found = bridge(before.motion, start, grown, before.last_ns, before.depth, before.turned)
         found = _with_former(found, world, before.former)
-        scale = found.scale / unit
-        T_scaled_first = mine[0].T_world_cam.copy()
-        T_scaled_first[:3, 3] *= scale
-        guess = GuessedPlace(mine[0].frame_id, found.covariance)
-        return scale, found.T_world_cam @ invert_transform(T_scaled_first), guess
+        first_id, T_world_first = mine[0].frame_id, mine[0].T_world_cam
+        return _moved(first_id, T_world_first, found.T_world_cam, found.scale / unit, found.covariance)
+
+    def come_back(
+        self, sight: Sight, T_world_cam: Array, motion: CameraMotion, world: WorldMap
+    ) -> tuple[float, Array, GuessedPlace] | None:
+        """Similarity that moves the newest submap to where its end says it is.
+
+        Args:
+            sight: An image in which an older submap was recognised, shortly after the newest one was lost.
+            T_world_cam: Its pose there.
+            motion: Of the camera, by poses in the newest submap.
+            world: The map.
+
+        Returns:
+            As ``place_again``; None where its place was not guessed, or where it is not known how the camera
+            moved since.
+        """
+        guess = world.guesses.get(world.keyframes[-1].submap)
+        depth = usual_depth(world, self._enough)
+        t_ns = sight.frame.t_source_ns
+        there = motion.whereabouts(t_ns, depth)
+        if guess is None or there is None:
+            return None
+        self._gyroscope.go_on(sight, motion, depth)
+        turned = self._gyroscope.turned
+        if not turned or turned[-1][0] != t_ns:
+            return None
+        since_ns, R_last_now = turned[0][0], turned[-1][1]
+        turn_rad = np.radians(rotation_angle_deg(R_last_now))
+        T_world_led = there.turned_alike(make_transform(there.T_world_last[:3, :3] @ R_last_now, np.zeros(3)))
+        gap_s = (t_ns - since_ns) * 1e-9
+        variances = motion.bridge_variances(t_ns, gap_s)
+        place_sigma = there.radius if variances is None else np.sqrt(variances[1])
+        sigma = (_TURN_SIGMA[0] + _TURN_SIGMA[1] * turn_rad, float(place_sigma))
+        T_world_first = world.poses[guess.frame_id]
+        T_first_world = invert_transform(T_world_first)
+        found = place_by_end(
+            guess.covariance, T_first_world @ T_world_led, T_first_world @ T_world_cam, sigma, depth
+        )
+        if found is None:
+            return None
+        return _moved(guess.frame_id, T_world_first, T_world_first @ found.T, found.scale, found.covariance)
+
+
+def _moved(
+    frame_id: int, T_world_first: Array, T_world_first_new: Array, scale: float, covariance: Array | None
+) -> tuple[float, Array, GuessedPlace]:
+    """Similarity that takes a camera to its new pose and scales what is seen from there."""
+    T_scaled_first = T_world_first.copy()
+    T_scaled_first[:3, 3] *= scale
+    T_new_old = T_world_first_new @ invert_transform(T_scaled_first)
+    return scale, T_new_old, GuessedPlace(frame_id, covariance)
 
 
 def _with_former(found: Bridge, world: WorldMap, former: int) -> Bridge:

@@ -13,19 +13,19 @@ K = np.array([[260, 0, 159.5], [0, 260, 119.5], [0, 0, 1.0]])
 STAYED = np.zeros(3)
 
 
-def scene(seed=0):
+def scene(seed=0, shape=(7, 9)):
     """A few large bright and dark patches: edges and shades, hardly a corner."""
     rng = np.random.default_rng(seed)
-    coarse = rng.uniform(60, 190, (7, 9)).astype(np.float32)
+    coarse = rng.uniform(60, 190, shape).astype(np.float32)
     return cv2.resize(coarse, (640, 480), interpolation=cv2.INTER_CUBIC)
 
 
-def wall(R_cam_wall, t_cam_wall, seed=0):
+def wall(R_cam_wall, t_cam_wall, seed=0, shape=(7, 9)):
     """What a camera sees of a wall at unit depth in front of where it began, ``(240, 320)`` grey levels."""
     K_wall = np.array([[260, 0, 319.5], [0, 260, 239.5], [0, 0, 1.0]])
     plane = R_cam_wall + np.outer(t_cam_wall, (0, 0, 1.0))
     H = K @ plane @ np.linalg.inv(K_wall)
-    return np.clip(cv2.warpPerspective(scene(seed), H, (320, 240)), 0, 255)
+    return np.clip(cv2.warpPerspective(scene(seed, shape), H, (320, 240)), 0, 255)
 
 
 def noisy(image, seed, gain=1.0):
@@ -38,6 +38,20 @@ def test_a_turn_is_told_by_images_without_corners(turn_deg):
     R = exp_so3(np.radians(turn_deg))
     found = turn_between(CAMERA, noisy(wall(np.eye(3), STAYED), 1), noisy(wall(R, STAYED), 2), STAYED)
     assert rotation_angle_deg(found.T @ R) < 0.15
+
+
+@pytest.mark.parametrize("deg", [-17.0, 17.0])
+def test_a_turn_out_of_reach_is_told_from_where_it_is_expected(deg):
+    """Where it is expected wrongly, the search begins from no turn as well."""
+    R, small = exp_so3((0, np.radians(deg), 0)), exp_so3((0.02, -0.03, 0.01))
+    before, now, hardly = (
+        noisy(wall(turn, STAYED, shape=(21, 27)), seed) for seed, turn in enumerate((np.eye(3), R, small), 1)
+    )
+    expected = exp_so3((0, np.radians(0.8 * deg), 0))
+    alone = turn_between(CAMERA, before, now, STAYED)
+    assert alone is None or rotation_angle_deg(alone.T @ R) > 5.0
+    assert rotation_angle_deg(turn_between(CAMERA, before, now, STAYED, expected).T @ R) < 0.15
+    assert rotation_angle_deg(turn_between(CAMERA, before, hardly, STAYED, expected).T @ small) < 0.15
 
 
 def test_a_strip_whose_height_is_rounded_tells_as_much():

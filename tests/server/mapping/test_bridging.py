@@ -119,6 +119,23 @@ def test_else_things_are_as_far_away_as_they_were(motion, first, step):
     np.testing.assert_array_equal(T, motion.predict(first * FRAME_NS))
 
 
+@pytest.mark.parametrize("speed", [0.0, 1.0])
+def test_images_tell_the_turn_of_a_camera_whose_speed_tells_no_unit(speed):
+    """It turned round on the spot, or the start is an absurd one: its place is known, and not its unit."""
+    turned = [(k * FRAME_NS, exp_so3((0, np.radians(9.0 * (k - 19)), 0))) for k in range(19, 24)]
+    start = start_at(23, step=0.0001)
+    motion = moved(speed, num=20)
+    found = bridge(motion, start, start, 19 * FRAME_NS, 8.0, turned)
+    assert found.scale == 8.0
+    assert np.degrees(np.arctan2(found.T_world_cam[0, 2], found.T_world_cam[2, 2])) == pytest.approx(36.0)
+    np.testing.assert_allclose(
+        found.T_world_cam[:3, 3], motion.predict(19 * FRAME_NS)[:3, 3], atol=0.005 + 0.25 * speed
+    )
+    assert found.covariance[6, 6] == pytest.approx(0.25), "by the depth alone"
+    blind = bridge(motion, start, start, 19 * FRAME_NS, 8.0, turned[:-1])
+    assert blind.covariance is None, "what images tell ends before the part begins"
+
+
 def test_a_first_map_begins_at_the_origin():
     start = start_at(0)
     T, scale, covariance = bridge(CameraMotion(CAMERA), start, start, None, 1.0)

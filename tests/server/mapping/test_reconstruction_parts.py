@@ -11,6 +11,7 @@ from drawn_boards import CAMERA, FRAME_NS, ate_percent, board_texture, frame_of,
 import semcast.server.mapping.map_builder as map_builder
 from semcast.common.geometry import (
     exp_so3,
+    invert_transform,
     make_transform,
     rotation_angle_deg,
 )
@@ -258,6 +259,33 @@ def test_a_turn_that_leaves_all_landmarks_behind_is_part_of_the_map():
     assert all(r.state is TrackingState.TRACKING for r in results[3:])
     assert results[-1].submap == 0
     assert ate_percent(reconstruction.final_trajectory(), truth) < 1.0
+
+
+def test_a_part_between_two_views_of_the_old_one_is_put_between(caplog):
+    """Who turns aside, goes on and turns back has lost the map twice; what is to the side looks otherwise."""
+    on = make_transform(np.eye(3), (0.12, 0, 0))
+    aside = make_transform(exp_so3((0, np.radians(18.0), 0)), np.zeros(3))
+    truth = [np.eye(4)]
+    for step in [on] * 12 + [aside] * 4 + [on] * 16 + [invert_transform(aside)] * 4 + [on] * 3:
+        truth.append(truth[-1] @ step)
+    T_side_world = make_transform(exp_so3((0, np.radians(-72.0), 0)), np.zeros(3))
+    pixels = np.stack([*np.meshgrid(range(CAMERA.width), range(CAMERA.height))], axis=-1).reshape(-1, 2)
+    seen = CAMERA.unproject(pixels.astype(float)).reshape(*CAMERA.shape_hw, 3)
+    reconstruction, results = make(lost_after_s=0.15), []
+    with caplog.at_level("INFO", logger="semcast.server.mapping.reconstruction"):
+        for k, T in enumerate(truth):
+            rays = seen @ T[:3, :3].T
+            is_side = np.arctan2(rays[..., 0], rays[..., 2]) > np.radians(40.0)
+            image = np.where(is_side[..., None], 255 - render(T_side_world @ T), render(T))
+            results.append(reconstruction.process(frame_of(k, image)))
+    assert "the newest one is put between" in caplog.text
+    assert {r.submap for r in results[20:32]} == {1}
+    assert {r.submap for r in results[-4:]} == {0}
+    trajectory = reconstruction.final_trajectory()
+    assert ate_percent(trajectory, truth) < 1.5
+    way, true_way = (np.linalg.norm(T[32][:3, 3] - T[20][:3, 3]) for T in (trajectory, truth))
+    unit = np.linalg.norm(trajectory[12][:3, 3] - trajectory[0][:3, 3]) / 1.44
+    assert way / unit == pytest.approx(true_way, rel=0.1)
 
 
 @pytest.mark.slow

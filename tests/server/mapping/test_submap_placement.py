@@ -1,5 +1,6 @@
 """A new part of the map is placed when it begins, and again when a second of it is known."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -8,6 +9,8 @@ from semcast.common.geometry import exp_se3, invert_transform, make_transform
 from semcast.server.mapping.camera_motion import CameraMotion
 from semcast.server.mapping.guessed_place import GuessedPlace
 from semcast.server.mapping.initialiser import Start
+from semcast.server.mapping.sight import Sight
+from semcast.server.mapping.state import DecodedFrame
 from semcast.server.mapping.submap_placement import SubmapPlacement
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
@@ -110,6 +113,52 @@ def test_a_part_that_nothing_led_to_is_not_placed_again(world):
     in_front = np.random.default_rng(1).uniform((-2, -2, 7), (2, 2, 9), (len(IDS), 3))
     add(world, [15, 18, 26], path, 1, in_front)
     assert placement.place_again(world, 1) is None
+
+
+def back_from(world, scale, *, seen=True, guessed=0.5, end=35):
+    """Come back from a part in another unit into the older one, at a frame of the path it has gone on."""
+    placement = SubmapPlacement(CAMERA, 20)
+    if guessed is not None:
+        covariance = np.diag(np.repeat((0.05, 0.1, guessed), (3, 3, 1)) ** 2)
+        world.guesses[1] = GuessedPlace(15, covariance)
+    in_front = np.random.default_rng(1).uniform((-2, -2, 7), (2, 2, 9), (len(IDS), 3))
+
+    def T_in_part(frame):
+        T_first_cam = invert_transform(path(15)) @ path(frame)
+        T_first_cam[:3, 3] /= scale
+        return path(15) @ T_first_cam
+
+    add(world, range(15, 31, 3), T_in_part, 1, in_front / scale + path(15)[:3, 3])
+    motion, wall = CameraMotion(CAMERA), np.random.default_rng(2).uniform(60, 190, (3, 4)).astype(np.float32)
+    grey = cv2.resize(wall, (320, 240), interpolation=cv2.INTER_CUBIC).astype(np.uint8)
+    for frame in range(15, 31):
+        motion.observe(frame, frame * FRAME_NS, T_in_part(frame), world.landmarks.xyz)
+    for frame in (30, end):
+        image = np.repeat((grey if seen or frame == 30 else np.full_like(grey, 90))[..., None], 3, axis=2)
+        sight = Sight(DecodedFrame(frame, frame * FRAME_NS, image), image[..., 0], np.ones(240, bool))
+        if frame == 30:
+            placement.note(sight, T_in_part(frame), motion, world)
+    return placement.come_back(sight, path(end), motion, world)
+
+
+@pytest.mark.parametrize("scale", [0.6, 1.5])
+def test_a_part_is_put_between_what_it_began_behind_and_where_the_camera_is_back(world, scale):
+    found = back_from(world, scale)
+    assert found[0] == pytest.approx(scale, rel=0.06)
+    world.transform_submap(1, 1, *found[:2])
+    for frame in (15, 21, 30):
+        np.testing.assert_allclose(world.poses[frame], path(frame), atol=0.2)
+    assert found[2].frame_id == 15
+    assert found[2].covariance[6, 6] < 0.1**2, "it was half of it before"
+
+
+@pytest.mark.parametrize(
+    "how",
+    [{"guessed": None}, {"seen": False}, {"end": 70}],
+    ids=["its place was not guessed", "no image tells how the camera turned", "long ago"],
+)
+def test_without_a_way_from_its_end_a_part_stays(world, how):
+    assert back_from(world, 1.5, **how) is None
 
 
 def test_a_first_map_is_where_it_is():

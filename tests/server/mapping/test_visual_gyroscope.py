@@ -56,14 +56,35 @@ def test_turns_add_up_while_the_camera_goes_on(speed):
         assert rotation_angle_deg(R.T @ exp_so3(k * TURN)) < 0.1 + 0.3 * k, "and not two degrees each"
 
 
-def test_after_another_view_nothing_is_known():
+def test_after_another_view_nothing_more_is_known():
     gyroscope, motion = VisualGyroscope(CAMERA), motion_of(0.0)
     gyroscope.begin(sight_at(0))
     gyroscope.go_on(sight_at(1), motion, 1.0)
     assert len(gyroscope.turned) == 2
     for k in (2, 3):
         gyroscope.go_on(sight_at(k, wall=WALL[::-1, ::-1]), motion, 1.0)
-        assert gyroscope.turned == []
+        assert [t_ns for t_ns, _ in gyroscope.turned] == [0, FRAME_NS]
+    gyroscope.begin(sight_at(4))
+    assert [t_ns for t_ns, _ in gyroscope.turned] == [4 * FRAME_NS]
+
+
+def test_a_turn_that_images_alone_do_not_reach_is_told_from_how_the_camera_turned_before():
+    """Twelve degrees a step are a sixth of the image."""
+    fine = np.random.default_rng(0).uniform(60, 190, (27, 63)).astype(np.float32)
+    fine = cv2.resize(fine, WALL.shape[::-1], interpolation=cv2.INTER_CUBIC)
+    fast = 4 * np.arange(5)
+    motion = CameraMotion(CAMERA)
+    for at, k in enumerate(fast[:2]):
+        pose = make_transform(exp_so3(k * TURN), np.zeros(3))
+        motion.observe(at, at * FRAME_NS, pose, np.zeros((0, 3)))
+    gyroscope, alone = VisualGyroscope(CAMERA), VisualGyroscope(CAMERA)
+    for at, k in enumerate(fast[1:], 1):
+        sight = sight_at(int(k), wall=fine)
+        sight = Sight(replace(sight.frame, t_source_ns=at * FRAME_NS), sight.grey, sight.usable)
+        for one, moved in ((gyroscope, motion), (alone, motion_of(0.0))):
+            one.begin(sight) if at == 1 else one.go_on(sight, moved, 1.0)
+    assert rotation_angle_deg(gyroscope.turned[-1][1].T @ exp_so3(12 * TURN)) < 1.0
+    assert len(alone.turned) < 4 or rotation_angle_deg(alone.turned[-1][1].T @ exp_so3(12 * TURN)) > 5.0
 
 
 def test_what_is_no_use_to_a_bridge_is_not_kept():
@@ -73,4 +94,4 @@ def test_what_is_no_use_to_a_bridge_is_not_kept():
         assert len(gyroscope.turned) == k
         frame = replace(rested.frame, t_source_ns=k * FRAME_NS)
         gyroscope.go_on(Sight(frame, rested.grey, rested.usable), motion, 1.0)
-    assert gyroscope.turned == [], "more than three seconds"
+    assert len(gyroscope.turned) == 31, "more than three seconds"
