@@ -55,15 +55,16 @@ def turn_between(
     Returns:
         ``R_cam1_cam0 (3, 3)``. None where the images have too little in common, or nothing in them tells.
     """
-    starts = [np.eye(3)] if R_expected is None else [np.eye(3), R_expected]
+    starts, correlation = [np.eye(3)] if R_expected is None else [np.eye(3), R_expected], 0.0
     for width_px in _WIDTHS_PX:
         small0, small1 = _small(grey0, width_px), _small(grey1, width_px)
         found = [_aligned(camera, small0, small1, way_depths, R) for R in starts]
-        aligned = max((a for a in found if a is not None), key=lambda a: a[1], default=None)
-        if aligned is None:
+        aligned = [a for a in found if a is not None]
+        if not aligned:
             return None
-        starts = [aligned[0]]
-    return aligned[0] if aligned[1] > _MIN_CORRELATION else None
+        R_cam1_cam0, correlation = max(aligned, key=lambda a: a[1])
+        starts = [R_cam1_cam0]
+    return starts[0] if correlation > _MIN_CORRELATION else None
 
 
 def _aligned(
