@@ -187,6 +187,13 @@ class Reconstruction:
     def _last_pose(self) -> Array | None:
         return None if self._last_posed_id is None else self._map.world.pose_of_frame(self._last_posed_id)
 
+    def _last_submap(self) -> int | None:
+        """Submap of the last frame with a pose, None without any."""
+        world, frame_id = self._map.world, self._last_posed_id
+        if frame_id is None or frame_id not in world.frames:
+            return None
+        return world.submap_of[world.frames[frame_id][0]]
+
     def _track(self, sight: Sight, T_world_guess: Array | None) -> FrameResult:
         since = time.perf_counter_ns()
         pose = self._locator.track(sight, T_world_guess)
@@ -312,10 +319,10 @@ class Reconstruction:
             return None
         # Nothing is given up for a place before there is a pose in it.
         if (pose := self._locator.pose_at(place)) is not None:
-            newest = self._map.world.keyframes[-1].submap
-            if place.submap < newest:
-                self._settle(newest, sight, pose.T_world_cam)
-            if whereabouts is None or place.submap != newest:
+            last = self._last_submap()
+            if last is not None and place.submap < last == self._map.world.keyframes[-1].submap:
+                self._settle(last, sight, pose.T_world_cam)
+            if whereabouts is None or place.submap != last:
                 self._motion.reset()
             self._map.go_on_from(place)
             self._tracks.adopt(place.ids, place.xy, RECOGNISED_CONFIDENCE)
