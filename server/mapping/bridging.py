@@ -56,8 +56,8 @@ def bridge(
     more the second one counts; it alone counts where the camera stood or the gap is long.
 
     The pose is where the camera must have got to. Its rotation is the one that images of the gap showed,
-    where there are any. Otherwise velocities change evenly from those before the gap to those of the submap
-    or, where the speed does not tell the scale, stay what they were.
+    where there are any. Otherwise, and so does the way, it changes evenly from that before the gap to that of
+    the submap. Where neither images nor the speed tell anything, the camera goes on as it did.
 
     Args:
         motion: Of the camera so far.
@@ -70,7 +70,7 @@ def bridge(
     Returns:
         The pose of the first camera of ``grown``, the scale, and how far off they may be: what the weighted
         mean leaves of the scale's, and of pose what ``bridge_variances`` tells. Nothing is known of it where
-        the motion did not tell the scale, or its past is too short.
+        neither the motion told the scale nor images the turn, or where the past is too short.
     """
     at_ns = grown.keyframes[0].t_source_ns
     T_world_guess = motion.predict(at_ns)

@@ -67,10 +67,8 @@ def place_by_end(
     turned, place, log_scale = np.eye(3), np.zeros(3), 0.0
     for _ in range(_ITERATIONS):
         led = np.exp(log_scale) * (turned @ t_led)
-        error = np.concatenate([
-            log_so3(T_first_found[:3, :3] @ (turned @ T_first_led[:3, :3]).T),
-            T_first_found[:3, 3] - led - place,
-        ])  # fmt: skip
+        turn_left = log_so3(T_first_found[:3, :3] @ (turned @ T_first_led[:3, :3]).T)
+        error = np.concatenate([turn_left, T_first_found[:3, 3] - led - place])
         jacobian = np.zeros((6, 7))
         jacobian[:3, :3] = jacobian[3:, 3:6] = np.eye(3)
         jacobian[3:, :3] = -skew(led)

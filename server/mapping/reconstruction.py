@@ -321,7 +321,7 @@ class Reconstruction:
         if (pose := self._locator.pose_at(place)) is not None:
             last = self._last_submap()
             if last is not None and place.submap < last == self._map.world.keyframes[-1].submap:
-                self._settle(last, sight, pose.T_world_cam)
+                self._settle(last, sight, pose.T_world_cam, place.submap)
             if whereabouts is None or place.submap != last:
                 self._motion.reset()
             self._map.go_on_from(place)
@@ -329,10 +329,10 @@ class Reconstruction:
             self._initialiser.clear()
         return pose
 
-    def _settle(self, submap: int, sight: Sight, T_world_cam: Array) -> None:
-        """Put the newest submap where it is, now that the camera is back from it at a known pose."""
+    def _settle(self, submap: int, sight: Sight, T_world_cam: Array, older: int) -> None:
+        """Put the newest submap where it is, now that the camera is back from it in an older one."""
         self._map.finish()
-        found = self._placement.come_back(sight, T_world_cam, self._motion, self._map.world)
+        found = self._placement.come_back(sight, T_world_cam, older, self._motion, self._map.world)
         if found is not None:
             logger.info(
                 "frame %d: back in an older part, the newest one is put between", sight.frame.frame_id

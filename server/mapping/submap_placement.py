@@ -132,13 +132,14 @@ class SubmapPlacement:
         return _moved(first_id, T_world_first, found.T_world_cam, found.scale / unit, found.covariance)
 
     def come_back(
-        self, sight: Sight, T_world_cam: Array, motion: CameraMotion, world: WorldMap
+        self, sight: Sight, T_world_cam: Array, submap: int, motion: CameraMotion, world: WorldMap
     ) -> tuple[float, Array, GuessedPlace] | None:
         """Similarity that moves the newest submap to where its end says it is.
 
         Args:
             sight: An image in which an older submap was recognised, shortly after the newest one was lost.
             T_world_cam: Its pose there.
+            submap: The older one, whose own place may be a guess.
             motion: Of the camera, by poses in the newest submap.
             world: The map.
 
@@ -170,7 +171,10 @@ class SubmapPlacement:
         )
         if found is None:
             return None
-        return _moved(guess.frame_id, T_world_first, T_world_first @ found.T, found.scale, found.covariance)
+        there_now = _with_former(
+            Bridge(T_world_first @ found.T, found.scale, found.covariance), world, submap
+        )
+        return _moved(guess.frame_id, T_world_first, *there_now)
 
 
 def _moved(

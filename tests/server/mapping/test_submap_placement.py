@@ -138,7 +138,7 @@ def back_from(world, scale, *, seen=True, guessed=0.5, end=35):
         sight = Sight(DecodedFrame(frame, frame * FRAME_NS, image), image[..., 0], np.ones(240, bool))
         if frame == 30:
             placement.note(sight, T_in_part(frame), motion, world)
-    return placement.come_back(sight, path(end), motion, world)
+    return placement.come_back(sight, path(end), 0, motion, world)
 
 
 @pytest.mark.parametrize("scale", [0.6, 1.5])
@@ -150,6 +150,17 @@ def test_a_part_is_put_between_what_it_began_behind_and_where_the_camera_is_back
         np.testing.assert_allclose(world.poses[frame], path(frame), atol=0.2)
     assert found[2].frame_id == 15
     assert found[2].covariance[6, 6] < 0.1**2, "it was half of it before"
+
+
+def test_a_part_put_behind_a_guessed_one_is_off_by_that_guess_too(world):
+    alone = back_from(world, 1.5)[2].covariance
+    again = WorldMap()
+    add(again, range(0, 10, 3), path, 0, np.random.default_rng(0).uniform((-2, -2, 5), (2, 2, 7), (60, 3)))
+    again.guesses[0] = GuessedPlace(0, np.diag([0.0] * 6 + [0.2**2]))
+    covariance = back_from(again, 1.5)[2].covariance
+    # Of another unit, all that is at frame 15 is as much further away from frame 0.
+    np.testing.assert_allclose(covariance[6, 6] - alone[6, 6], 0.2**2)
+    np.testing.assert_allclose(covariance[5, 5] - alone[5, 5], (0.2 * 0.2 * 15) ** 2, rtol=0.2)
 
 
 @pytest.mark.parametrize(
