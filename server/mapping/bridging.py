@@ -83,6 +83,8 @@ def bridge(
     speed, speed_sigma = motion.speed_at(first.t_source_ns)
     gone = speed * elapsed_s
     turned = [then for then in turned if then[0] <= at_ns]
+    # Of a source that gives two images one time, the second tells no speed.
+    later = [k for k in grown.keyframes if k.t_source_ns > at_ns]
     scale, weight = depth, _DEPTH_SIGMA**-2
     if (
         since_s < _MAX_BRIDGE_S
@@ -93,10 +95,8 @@ def bridge(
         weights = weight, 1.0 / (_SPEED_SIGMA**2 + error**2 + speed_sigma**2)
         scale = float(np.exp(np.average(np.log((depth, gone / way)), weights=weights)))
         weight = sum(weights)
-    elif not turned or turned[-1][0] != at_ns:
+    elif not later or not turned or turned[-1][0] != at_ns:
         return Bridge(T_world_guess, depth, None)
-    # Of a source that gives two images one time, the second tells no speed.
-    later = [k for k in grown.keyframes if k.t_source_ns > at_ns]
     soon = ([k for k in later if k.t_source_ns - at_ns <= _LATER_NS] or later[:1])[-1]
     T_later, later_s = soon.T_world_cam.copy(), (soon.t_source_ns - at_ns) * 1e-9
     T_later[:3, 3] *= scale

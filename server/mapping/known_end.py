@@ -21,6 +21,8 @@ _ANYWHERE = (1.0, 10.0, 0.5)
 _LEAST = (0.01, 0.02, 0.01)
 #: Tracking drifts: where the part ends is off by this share of the way to there, beside what the gap adds.
 _DRIFT_SHARE = 0.02
+#: A pose that was found is off by this share of the scene's depth at least.
+_FOUND_SHARE = 0.001
 #: The guess and the end contradict each other beyond this sum of squared errors in standard deviations: the
 #: 99.9 % quantile of chi-squared with six degrees of freedom. One of them is wrong, and nothing tells which.
 _MOST_APART = 22.5
@@ -62,7 +64,8 @@ def place_by_end(
     worth = _variances(_ANYWHERE, depth) if guessed is None else guessed + _variances(_LEAST, depth)
     prior = np.linalg.inv(worth)
     t_led = T_first_led[:3, 3]
-    place_sigma = float(np.hypot(sigma[1], _DRIFT_SHARE * np.linalg.norm(t_led)))
+    drift = _DRIFT_SHARE * float(np.linalg.norm(t_led))
+    place_sigma = float(np.linalg.norm([sigma[1], drift, _FOUND_SHARE * depth]))
     weight = np.repeat((sigma[0], place_sigma), 3) ** -2.0
     turned, place, log_scale = np.eye(3), np.zeros(3), 0.0
     for _ in range(_ITERATIONS):

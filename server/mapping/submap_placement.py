@@ -138,7 +138,7 @@ class SubmapPlacement:
 
         Args:
             sight: An image in which an older submap was recognised, shortly after the newest one was lost.
-            T_world_cam: Its pose there.
+            T_world_cam: ``(4, 4)`` its pose there.
             submap: The older one, whose own place may be a guess.
             motion: Of the camera, by poses in the newest submap.
             world: The map.

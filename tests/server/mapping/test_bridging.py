@@ -134,6 +134,10 @@ def test_images_tell_the_turn_of_a_camera_whose_speed_tells_no_unit(speed):
     assert found.covariance[6, 6] == pytest.approx(0.25), "by the depth alone"
     blind = bridge(motion, start, start, 19 * FRAME_NS, 8.0, turned[:-1])
     assert blind.covariance is None, "what images tell ends before the part begins"
+    for keyframe in start.keyframes:
+        keyframe.t_source_ns = 23 * FRAME_NS
+    at_once = bridge(motion, start, start, 19 * FRAME_NS, 8.0, turned)
+    assert at_once.covariance is None, "nothing came after it by which to tell its speed"
 
 
 def test_a_first_map_begins_at_the_origin():

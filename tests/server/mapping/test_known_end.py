@@ -40,6 +40,15 @@ def test_a_unit_that_was_guessed_is_told_by_how_far_the_camera_got(scale):
     assert np.sqrt(found.covariance[6, 6]) == pytest.approx(np.hypot(0.094, 0.064) / (3.05 * scale), rel=0.4)
 
 
+def test_a_part_without_a_way_keeps_its_unit():
+    """The past of a camera at rest promises a gap without any error, and there is no drift."""
+    T = exp_se3([0.0, 0.02, 0.0, 0.03, 0.0, 0.0])
+    found = place_by_end(guess(), np.eye(4), T, (0.01, 0.0), 4.0)
+    assert found.scale == pytest.approx(1.0)
+    np.testing.assert_allclose(found.T, T, atol=0.001)
+    assert np.sqrt(found.covariance[6, 6]) == pytest.approx(0.5, rel=0.01)
+
+
 def test_without_a_guess_the_end_alone_tells_turn_and_place():
     T = exp_se3([0.3, 1.2, -0.2, 5.0, -2.0, 1.0])
     there = moved(1.0, T, T_FIRST_LED)
