@@ -20,7 +20,10 @@ Array = NDArray[np.float64]
 
 #: A camera stops at once when the image moves by less than this share of what was expected of it ...
 _STILL_SHARE = 0.15
-#: ... and that was at least this many pixels: less is within the error of poses.
+#: ... not only in the middle of its points: of a hand that turns one way while it goes the other, points at one
+#: depth stay and the rest do not. This share of the points has moved by no more.
+_STILL_QUANTILE = 0.9
+#: And that was at least this many pixels in the middle: less is within the error of poses.
 _LEAST_EXPECTED_PX = 2.0
 #: It went on when the image has moved by this share of what it would have moved all the while,
 _GONE_SHARE = 0.67
@@ -155,7 +158,7 @@ class CameraMotion:
             return []
         since_ns, T_world_moving = self._moving
         moved, expected = self._displacements(T_world_moving, (T_world_cam, T_world_go), xyz)
-        moved_px, expected_px = _median_length(moved), _median_length(expected)
+        moved_px, expected_px = _length(moved), _length(expected)
         if not self._still and expected_px < _LEAST_EXPECTED_PX:
             self._go_on(t_source_ns, T_world_cam)
             return []
@@ -164,7 +167,8 @@ class CameraMotion:
         known_ns = min(t_source_ns - since_ns, round(MAX_EXTRAPOLATION_S / _S_PER_NS))
         steps = known_ns / max(1, t_source_ns - before_ns)
         step_px = expected_px / max(1.0, steps)
-        if moved_px < _STILL_SHARE * step_px:
+        most_px, most_expected_px = (_length(m, _STILL_QUANTILE) for m in (moved, expected))
+        if most_px < _STILL_SHARE * most_expected_px / max(1.0, steps):
             self._still.append(frame_id)
             self._still_ns = t_source_ns
             return []
@@ -194,7 +198,7 @@ class CameraMotion:
             del self._recent[0]
         since_ns, T_world_then = self._recent[0]
         moved = self._displacements(T_world_then, [T_world_cam], xyz)[0]
-        is_near = _median_length(moved) <= _REST_SHARE * self._camera.width
+        is_near = _length(moved) <= _REST_SHARE * self._camera.width
         # A camera that turned right round has no point in front of it both then and now.
         self._rests = t_source_ns - since_ns >= _REST_NS and len(moved) > 0 and is_near
 
@@ -212,8 +216,9 @@ class CameraMotion:
         return [p - pixels[0] for p in pixels[1:]]
 
 
-def _median_length(motion: Array) -> float:
-    return float(np.median(np.linalg.norm(motion, axis=1))) if len(motion) else 0.0
+def _length(motion: Array, quantile: float = 0.5) -> float:
+    """A quantile of the lengths of ``motion (M, 2)``, 0 without any."""
+    return float(np.quantile(np.linalg.norm(motion, axis=1), quantile)) if len(motion) else 0.0
 
 
 def _cosine(a: Array, b: Array) -> float:

@@ -55,6 +55,17 @@ def test_a_camera_that_turns_back_did_not_go_on():
     assert go(CameraMotion(CAMERA), 0.2 * np.array([0, 1, 2, 3, 4, 4, 4, 1.5, 0])) == {}
 
 
+def test_a_hand_that_turns_one_way_while_it_goes_the_other_has_not_stopped():
+    # Points at 10 m stay where they are in the image; nearer and further ones move.
+    T_before = [at(0.2 * k) for k in range(5)]
+    T_against = T_before[-1] @ make_transform(exp_so3((0.0, -0.02, 0.0)), (0.2, 0.0, 0.0))
+    motion = CameraMotion(CAMERA)
+    withdrawn = [motion.observe(k, k * FRAME_NS, T, POINTS) for k, T in enumerate(T_before)]
+    withdrawn.append(motion.observe(5, 5 * FRAME_NS, T_against, POINTS))
+    withdrawn.append(motion.observe(6, 6 * FRAME_NS, at(1.2), POINTS))
+    assert withdrawn == [[]] * 7
+
+
 def test_a_shaking_camera_turns_at_its_ends():
     assert go(CameraMotion(CAMERA), 0.2 * np.sin(np.pi / 4 + np.arange(40) * np.pi / 2)) == {}
 
