@@ -59,6 +59,7 @@ Reports, tables and pictures
     path_tables         tables of path errors
     pair_summary        tables of frame pairs
     trajectory_summary  what confidence does to paths
+    link_summary        the same by link, over all recordings
     depth_summary       what confidence does to depth maps
     plots               plots of results
     run_plots           plots of one run

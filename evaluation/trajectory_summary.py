@@ -15,6 +15,10 @@ from semcast.evaluation.markdown import number, table
 from semcast.evaluation.statistics import MIN_SAMPLES, scatter_of_mean
 
 Array = NDArray[np.float64]
+Report = Mapping[str, Any]
+
+#: Least error in percent of the path: one of exactly 0 has no logarithm.
+LEAST_PERCENT = 1e-6
 
 _SEED = 0
 
@@ -40,33 +44,39 @@ class Pairing:
     num_failed: int = 0
 
 
-def pairings_of(reports: Iterable[Mapping[str, Any]]) -> list[Pairing]:
-    """Return all cells of reports of ``semcast eval trajectory`` that have both modes and enough seeds.
+def paired_runs(report: Report) -> Iterator[tuple[float, list[tuple[Report, Report]]]]:
+    """Yield ``(snr_db, [(robust, off), ...])`` of a report: runs of both modes with one seed, in its order.
 
-    Those over a trace are left out: their SNR is but its start.
+    Nothing of one over a trace: its SNR is but its start.
     """
+    if report["settings"]["link"]["channel"] == "trace":
+        return
+    runs: dict[float, dict[str, dict[int, Report]]] = {}
+    for cell in report["cells"]:
+        if cell["snr_db"] is not None:
+            of_mode = {run["seed"]: run for run in cell["runs"]}
+            runs.setdefault(cell["snr_db"], {})[cell["confidence"]] = of_mode
+    for snr_db, modes in runs.items():
+        ours, theirs = modes.get("robust", {}), modes.get("off", {})
+        yield snr_db, [(ours[seed], theirs[seed]) for seed in sorted(ours.keys() & theirs.keys())]
+
+
+def pairings_of(reports: Iterable[Report]) -> list[Pairing]:
+    """Return all cells of reports of ``semcast eval trajectory`` that have both modes and enough seeds."""
     found = []
     for report in reports:
-        if report["settings"]["link"]["channel"] == "trace":
-            continue
-        runs: dict[float, dict[str, dict[int, Mapping[str, Any]]]] = {}
-        for cell in report["cells"]:
-            if cell["snr_db"] is not None:
-                of_mode = {run["seed"]: run for run in cell["runs"]}
-                runs.setdefault(cell["snr_db"], {})[cell["confidence"]] = of_mode
-        for snr_db, modes in runs.items():
-            a, b = modes.get("robust", {}), modes.get("off", {})
-            shared = sorted(a.keys() & b.keys())
-            both = [(a[s]["ate_percent"], b[s]["ate_percent"]) for s in shared]
+        for snr_db, shared in paired_runs(report):
+            both = [(a["ate_percent"], b["ate_percent"]) for a, b in shared]
             known = [pair for pair in both if None not in pair]
             if len(known) < MIN_SAMPLES:  # fewer seeds say nothing about bad runs
                 continue
-            # An error of exactly 0 has no logarithm.
-            values = np.maximum(np.array(known, dtype=np.float64), 1e-6)
+            values = np.maximum(np.array(known, dtype=np.float64), LEAST_PERCENT)
             settings = report["settings"]
             title = f"{report['sequence']}, {settings['codec']}, {settings['link']['channel']}, {snr_db:g} dB"
             title += f", {gap_s:g} s gap" if (gap_s := settings.get("gap_s")) else ""
-            posed = [float(np.mean([runs_of[s]["completeness"] for s in shared])) for runs_of in (a, b)]
+            posed = [
+                float(np.mean([run["completeness"] for run in runs])) for runs in zip(*shared, strict=True)
+            ]
             num_failed = len(both) - len(known)
             found.append(Pairing(title, values[:, 0], values[:, 1], posed[0], posed[1], num_failed))
     return found
@@ -82,7 +92,7 @@ def ratio_interval(pairings: Sequence[Pairing]) -> tuple[float, float, float]:
     return float(np.exp(mean)), float(low), float(high)
 
 
-def trajectory_summary(reports: Iterable[Mapping[str, Any]]) -> str:
+def trajectory_summary(reports: Iterable[Report]) -> str:
     """Return the table as Markdown, empty without a cell of enough seeds.
 
     Args:
