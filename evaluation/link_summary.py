@@ -15,11 +15,19 @@ from numpy.typing import NDArray
 from semcast.common.codec import DEFAULT_CODEC
 from semcast.evaluation.markdown import table
 from semcast.evaluation.statistics import MIN_SAMPLES, scatter_of_mean
-from semcast.evaluation.trajectory_summary import LEAST_PERCENT, paired_runs
+from semcast.evaluation.trajectory_summary import LEAST_ERROR, paired_runs
 
 Array = NDArray[np.float64]
 Report = Mapping[str, Any]
 
+#: Errors of a run, and how the table calls them: of all of the path, after the last correction and as it was
+#: published, and of the motion from one frame to the next.
+FIGURES = {
+    "ate_percent": "path in the end",
+    "ate_at_once_percent": "path, live",
+    "rpe_trans_percent": "way from frame to frame",
+    "rpe_rot_deg": "turn from frame to frame",
+}
 #: Runs of a recording over one link from which it counts.
 _MIN_RUNS = 3
 _SEED = 0
@@ -33,16 +41,14 @@ class LinkComparison:
         channel: Name of the channel.
         snr_db: Of the link.
         num_runs: Runs of each mode.
-        log_ratios: ``(N,)`` of each recording, the mean over its runs of the logarithm of the errors' ratio:
-            of the path after the last correction.
-        log_ratios_live: ``(N,)`` the same of poses as they were published.
+        log_ratios: ``(N, 4)`` of each recording, the mean over its runs of the logarithm of the ratio of each
+            of ``FIGURES``.
     """
 
     channel: str
     snr_db: float
     num_runs: int
     log_ratios: Array
-    log_ratios_live: Array
 
 
 def compare_links(reports: Iterable[Report]) -> list[LinkComparison]:
@@ -55,22 +61,20 @@ def compare_links(reports: Iterable[Report]) -> list[LinkComparison]:
     Returns:
         By channel, then SNR.
     """
-    found: dict[tuple[str, float], list[tuple[int, float, float]]] = {}
+    found: dict[tuple[str, float], list[Array]] = {}
     for report in reports:
         settings = report["settings"]
         is_other = settings["codec"] != DEFAULT_CODEC or settings.get("gap_s")
         if is_other or settings["link"].get("doppler_hz"):
             continue
         for snr_db, shared in paired_runs(report):
-            live = _log_ratios(shared, "ate_at_once_percent")
-            final = _log_ratios(shared, "ate_percent")
-            if min(len(live), len(final)) >= _MIN_RUNS:
-                of_link = found.setdefault((settings["link"]["channel"], snr_db), [])
-                of_link.append((len(final), float(np.mean(final)), float(np.mean(live))))
+            logs = _log_ratios(shared)
+            if len(logs) >= _MIN_RUNS:
+                found.setdefault((settings["link"]["channel"], snr_db), []).append(logs)
     return [
-        LinkComparison(*link, sum(r[0] for r in rows), *(np.array([r[k] for r in rows]) for k in (1, 2)))
-        for link, rows in sorted(found.items())
-        if len(rows) >= MIN_SAMPLES
+        LinkComparison(*link, sum(map(len, of_link)), np.stack([logs.mean(axis=0) for logs in of_link]))
+        for link, of_link in sorted(found.items())
+        if len(of_link) >= MIN_SAMPLES
     ]
 
 
@@ -82,16 +86,15 @@ def link_summary(reports: Iterable[Report]) -> str:
 
 def _lines(links: Sequence[LinkComparison]) -> Iterator[str]:
     yield "Geometric mean over recordings of the error with confidence over that without, and its 95 %"
-    yield "interval over recordings: of the path in the end, and of poses as they were published.\n"
+    yield "interval over recordings.\n"
     yield from table(
-        ("link", "recordings", "runs", "path in the end", "live"),
+        ("link", "recordings", "runs", *FIGURES.values()),
         [
             (
                 f"{link.channel}, {link.snr_db:g} dB",
                 len(link.log_ratios),
                 link.num_runs,
-                _with_interval(link.log_ratios),
-                _with_interval(link.log_ratios_live),
+                *(_with_interval(logs) for logs in link.log_ratios.T),
             )
             for link in links
         ],
@@ -105,7 +108,11 @@ def _with_interval(log_ratios: Array) -> str:
     return f"{np.exp(mean):.2f} ({low:.2f} .. {high:.2f})"
 
 
-def _log_ratios(shared: Sequence[tuple[Report, Report]], figure: str) -> Array:
-    both = [(ours.get(figure), theirs.get(figure)) for ours, theirs in shared]
-    known = np.array([pair for pair in both if None not in pair], dtype=np.float64).reshape(-1, 2)
-    return np.asarray(-np.diff(np.log(np.maximum(known, LEAST_PERCENT)), axis=1).ravel())
+def _log_ratios(shared: Sequence[tuple[Report, Report]]) -> Array:
+    """Logarithms ``(R, 4)`` of the ratios of ``FIGURES``, of runs that have all of them in both modes."""
+    both = np.array(
+        [[[run.get(figure) for figure in FIGURES] for run in runs] for runs in shared], dtype=np.float64
+    ).reshape(-1, 2, len(FIGURES))
+    known = both[np.isfinite(both).all(axis=(1, 2))]
+    ours, theirs = np.log(np.maximum(known, LEAST_ERROR)).transpose(1, 0, 2)
+    return np.asarray(ours - theirs)

@@ -17,8 +17,8 @@ from semcast.evaluation.statistics import MIN_SAMPLES, scatter_of_mean
 Array = NDArray[np.float64]
 Report = Mapping[str, Any]
 
-#: Least error in percent of the path: one of exactly 0 has no logarithm.
-LEAST_PERCENT = 1e-6
+#: Least error, in whatever unit: one of exactly 0 has no logarithm.
+LEAST_ERROR = 1e-6
 
 _SEED = 0
 
@@ -70,7 +70,7 @@ def pairings_of(reports: Iterable[Report]) -> list[Pairing]:
             known = [pair for pair in both if None not in pair]
             if len(known) < MIN_SAMPLES:  # fewer seeds say nothing about bad runs
                 continue
-            values = np.maximum(np.array(known, dtype=np.float64), LEAST_PERCENT)
+            values = np.maximum(np.array(known, dtype=np.float64), LEAST_ERROR)
             settings = report["settings"]
             title = f"{report['sequence']}, {settings['codec']}, {settings['link']['channel']}, {snr_db:g} dB"
             title += f", {gap_s:g} s gap" if (gap_s := settings.get("gap_s")) else ""

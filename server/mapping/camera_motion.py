@@ -20,8 +20,8 @@ Array = NDArray[np.float64]
 
 #: A camera stops at once when the image moves by less than this share of what was expected of it ...
 _STILL_SHARE = 0.15
-#: ... not only in the middle of its points: of a hand that turns one way while it goes the other, points at one
-#: depth stay and the rest do not. This share of the points has moved by no more.
+#: ... not only in the middle of its points: of a hand that turns one way while it goes the other, points at
+#: one depth stay and the rest do not. This share of the points has moved by no more.
 _STILL_QUANTILE = 0.9
 #: And that was at least this many pixels in the middle: less is within the error of poses.
 _LEAST_EXPECTED_PX = 2.0
