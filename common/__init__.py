@@ -74,6 +74,7 @@ Settings, files, processes
     cores                   processor cores and threads
     heap                    memory that frames take again and again
     interrupts              signals that end a run, Ctrl-C among them
+    leaving                 the end of a process whose threads still work
     role                    a process of a running system as a child
     parent                  children that end with the process that started them
     worker_guard            unexpected exceptions in worker threads

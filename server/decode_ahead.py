@@ -14,6 +14,9 @@ In = TypeVar("In")
 Out = TypeVar("Out")
 
 POLL_S = 0.1
+#: How long the end waits for the frame that is being decoded, which nobody takes any more. Large images take
+#: tens of seconds.
+CLOSE_S = 1.0
 
 
 class DecodeAhead(Generic[In, Out]):
@@ -104,9 +107,15 @@ class DecodeAhead(Generic[In, Out]):
         return decoded
 
     def close(self) -> None:
-        """End the thread; a decoded frame still in the slot is dropped. Idempotent."""
+        """End the thread; a decoded frame still in the slot is dropped. Idempotent.
+
+        One that is being decoded is not waited for beyond ``CLOSE_S``: the thread ends by itself behind it,
+        or is left when the process ends.
+        """
         self._stopping.set()
         with self._condition:
             self._slot = None
             self._condition.notify_all()
-        self._thread.join(10.0)
+        self._thread.join(CLOSE_S)
+        if self._thread.is_alive():
+            logger.warning("the frame that is being decoded is left: its image is not waited for")

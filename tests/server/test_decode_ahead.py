@@ -165,3 +165,16 @@ def test_what_nobody_took_before_the_end_is_dropped():
     ahead.close()
     assert ahead.get(0.0) is None
     assert not ahead.is_busy
+
+
+def test_the_end_does_not_wait_long_for_a_frame_that_is_being_decoded(caplog, monkeypatch):
+    monkeypatch.setattr("semcast.server.decode_ahead.CLOSE_S", 0.05)
+    begun, may_end = threading.Event(), threading.Event()
+    ahead = DecodeAhead(Inbox(1).take, lambda x: begun.set() or may_end.wait(60), lambda m, r: None)
+    assert begun.wait(60)
+    ahead.close()
+    assert [record.getMessage() for record in caplog.records] == [
+        "the frame that is being decoded is left: its image is not waited for"
+    ]
+    may_end.set()
+    until(lambda: not ahead._thread.is_alive(), "the end of the thread behind it")
