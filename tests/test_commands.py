@@ -452,6 +452,32 @@ def test_a_signal_ends_a_run_in_good_order(number, code):
         signal.signal(number, inherited)
 
 
+@pytest.mark.parametrize("signals", [("SIGINT", "SIGINT"), ("SIGTERM", "SIGINT"), ("SIGTERM", "SIGTERM")])
+def test_a_second_signal_ends_a_run_at_once(signals, monkeypatch):
+    monkeypatch.setattr("semcast.commands.running._AGAIN_S", 0.0)
+
+    def work(stop):
+        for name in signals:
+            signal.raise_signal(getattr(signal, name))
+        raise AssertionError("it goes on")
+
+    with pytest.raises(KeyboardInterrupt):
+        run_until_stopped(work)
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
+def test_one_request_to_end_may_come_twice(name):
+    done = []
+
+    def work(stop):
+        signal.raise_signal(getattr(signal, name))
+        signal.raise_signal(getattr(signal, name))
+        done.append(stop.is_set())
+
+    assert run_until_stopped(work) == 0
+    assert done == [True]
+
+
 def test_a_run_under_nohup_outlives_its_terminal():
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     stopped = []

@@ -3,6 +3,7 @@
 import argparse
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, TypeVar
@@ -16,6 +17,9 @@ S = TypeVar("S")
 
 #: Exit code of a run that Ctrl-C ended.
 INTERRUPTED = 130
+#: A request to end (SIGTERM) that comes again sooner is the same one: ``timeout`` sends it to a process and
+#: then to its group.
+_AGAIN_S = 1.0
 
 
 def add_settings(parser: argparse.ArgumentParser, cls: type, skip: frozenset[str] = frozenset()) -> None:
@@ -49,14 +53,20 @@ class Interrupted:
 
 @contextmanager
 def stop_on_signals(stop: threading.Event) -> Iterator[Interrupted]:
-    """Set ``stop`` on Ctrl-C and ``ending_signals``; a second Ctrl-C raises ``KeyboardInterrupt`` as ever."""
+    """Set ``stop`` on Ctrl-C and ``ending_signals``; Ctrl-C after one of them raises ``KeyboardInterrupt``.
+
+    So does SIGTERM after another. A hang-up does not: a terminal that goes may send several.
+    """
     interrupted = Interrupted()
+    first_s: dict[int, float] = {}
 
     def handle(number: int, _frame: object) -> None:
-        if number == signal.SIGINT:
-            if interrupted.by_user:
-                raise KeyboardInterrupt
-            interrupted.by_user = True
+        now_s = time.monotonic()
+        is_asked_again = number == signal.SIGTERM and now_s - first_s.get(number, now_s) >= _AGAIN_S
+        if (number == signal.SIGINT and first_s) or is_asked_again:
+            raise KeyboardInterrupt
+        first_s.setdefault(number, now_s)
+        interrupted.by_user = number == signal.SIGINT or interrupted.by_user
         stop.set()
 
     with signals_handled([signal.SIGINT, *ending_signals()], handle):
