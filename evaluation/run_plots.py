@@ -15,7 +15,7 @@ from semcast.common.run_summary import read_summary
 from semcast.common.trajectory import Trajectory, read_tum
 from semcast.common.trajectory_error import AteResult, ate, match_times
 from semcast.evaluation.plots import new_grid, save_figure
-from semcast.server.frame_rows import FrameRow, read_rows
+from semcast.server.frame_rows import FrameRow, RowsOnDisk
 from semcast.server.sent_frames import stretches
 
 logger = logging.getLogger(__name__)
@@ -85,7 +85,8 @@ class RunToPlot:
         """
         if not folder.is_dir():
             raise SourceError(f"{folder} is not a folder; give the folder that --out wrote")
-        path, rows = folder / TRAJECTORY_NAME, read_rows(folder / FRAMES_NAME)
+        path, there = folder / TRAJECTORY_NAME, RowsOnDisk.read(folder / FRAMES_NAME)
+        rows = there.all_good()
         if not path.is_file() and not (folder / FRAMES_NAME).is_file():
             raise SourceError(
                 f"{folder} holds neither {TRAJECTORY_NAME} nor {FRAMES_NAME}: there is nothing to plot"
@@ -96,9 +97,13 @@ class RunToPlot:
         if not rows and not len(trajectory):
             raise SourceError(f"{folder}: no frame was decoded: nothing to plot")
         try:
-            told = _told_by(read_summary(folder))
+            summary = read_summary(folder)
+            told = _told_by(summary)
+            missing = there.missing((summary.get("frames") or {}).get("tracked"))
         except (AttributeError, TypeError, ValueError, OverflowError) as err:
             raise SourceError(f"{folder / SUMMARY_NAME} is none that a run wrote: {err}") from err
+        for text in missing:
+            logger.warning("%s: %s", there.path, text)
         return RunToPlot(name=folder.name, trajectory=trajectory, rows=rows, truth=truth, **told)
 
 

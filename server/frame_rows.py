@@ -15,7 +15,7 @@ import numpy as np
 
 from semcast.common.errors import SemcastError, tell_nobody
 from semcast.common.metrics import drops_in_words, duration_percentiles
-from semcast.common.run_folder import FRAMES_NAME
+from semcast.common.run_folder import FRAMES_NAME, SUMMARY_NAME
 from semcast.common.trajectory import Trajectory
 from semcast.common.trajectory_error import trajectory_summary
 from semcast.common.whole_file import whole_file
@@ -229,43 +229,85 @@ def _line(row: FrameRow) -> bytes:
     return (json.dumps(plain(asdict(row)), allow_nan=False) + "\n").encode()
 
 
+@dataclass(frozen=True)
+class RowsOnDisk:
+    """What there is in a ``frames.jsonl``.
+
+    Attributes:
+        path: Of the file.
+        rows: One per frame. Of a frame that was tracked again, after its server had ended before it could say
+            so, the last row counts.
+        bad: What is wrong with each line that is no row, but for the last one.
+        ends_within_row: Whether the last line is no whole row, as a process leaves it that is killed.
+    """
+
+    path: Path
+    rows: list[FrameRow]
+    bad: list[str]
+    ends_within_row: bool
+
+    @classmethod
+    def read(cls, path: Path) -> "RowsOnDisk":
+        """Read the file; of one that is not there, there are no rows."""
+        if not path.exists():
+            return cls(path, [], [], False)
+        rows: dict[int, FrameRow] = {}
+        bad: list[str] = []
+        ends_within_row = False
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines(keepends=True)
+        for number, line in enumerate(lines, start=1):
+            try:
+                row = FrameRow(**json.loads(line))
+                rows[row.frame_id] = row
+            except (ValueError, TypeError) as err:
+                if number < len(lines):
+                    bad.append(f"{path}:{number} is not a frame row: {err}")
+                else:
+                    ends_within_row = True
+        return cls(path, list(rows.values()), bad, ends_within_row)
+
+    def all_good(self) -> list[FrameRow]:
+        """Return the rows.
+
+        Raises:
+            SemcastError: A line before the last one is not a row.
+        """
+        if self.bad:
+            raise SemcastError(self.bad[0])
+        return self.rows
+
+    def missing(self, num_tracked: int | None) -> list[str]:
+        """Say in a line each what of the rows of a run is not there any more.
+
+        Args:
+            num_tracked: Frames that it tracked, as its summary says; None where it says nothing.
+        """
+        lines: list[str] = []
+        if self.ends_within_row:
+            lines.append("the last line is no whole row: the run was killed, or is writing it")
+        if num_tracked is not None and len(self.rows) < num_tracked:
+            lines.append(
+                f"{len(self.rows)} rows of the {num_tracked} frames that {SUMMARY_NAME} says were tracked: "
+                "the file was cut or changed since"
+            )
+        return lines
+
+
 def _rows_to_resume(path: Path) -> list[FrameRow]:
     """Read the rows of a run that goes on; it must not end for good with a damaged line."""
-    rows, bad = _read(path)
-    if bad:
+    there = RowsOnDisk.read(path)
+    if bad := there.bad:
         logger.warning("%s: %d lines are no frame rows and are left out: %s", path, len(bad), bad[0])
-    return rows
-
-
-def _read(path: Path) -> tuple[list[FrameRow], list[str]]:
-    """Return the rows of a file and what is wrong with lines that are none, but for the last one."""
-    if not path.exists():
-        return [], []
-    rows: dict[int, FrameRow] = {}
-    bad: list[str] = []
-    lines = path.read_text(encoding="utf-8", errors="replace").splitlines(keepends=True)
-    for number, line in enumerate(lines, start=1):
-        try:
-            row = FrameRow(**json.loads(line))
-            rows[row.frame_id] = row
-        except (ValueError, TypeError) as err:
-            if number < len(lines):
-                bad.append(f"{path}:{number} is not a frame row: {err}")
-    return list(rows.values()), bad
+    return there.rows
 
 
 def read_rows(path: Path) -> list[FrameRow]:
     """Read ``frames.jsonl`` up to its last whole line; none where there is no file.
 
-    Of a frame that was tracked again, after its server had ended before it could say so, the last row counts.
-
     Raises:
         SemcastError: A line before the last one is not a row.
     """
-    rows, bad = _read(path)
-    if bad:
-        raise SemcastError(bad[0])
-    return rows
+    return RowsOnDisk.read(path).all_good()
 
 
 def summarise(

@@ -128,6 +128,36 @@ def test_a_run_is_described(run_folder):
     assert "tracked by time of arrival: 3.9 frames a second" in text
 
 
+def test_rows_that_a_killed_run_left_are_described_without_the_last_one(run_folder):
+    assert "frames.jsonl: the last" not in text_of(run_folder)
+    rows = run_folder / "frames.jsonl"
+    rows.write_bytes(rows.read_bytes()[:-40])
+    text = text_of(run_folder)
+    assert "frames.jsonl: the last line is no whole row: the run was killed, or is writing it" in text
+    assert "trajectory.tum: " in text
+
+
+@pytest.mark.parametrize(
+    ("kept", "fault"), [(6, None), (4, "4 rows of the 6 frames"), (0, "0 rows of the 6")]
+)
+def test_rows_that_are_fewer_than_the_summary_says_are_counted(run_folder, kept, fault, capsys):
+    (run_folder / "summary.json").write_text('{"frames": {"tracked": 6}}')
+    rows = run_folder / "frames.jsonl"
+    rows.write_text("".join(rows.read_text().splitlines(keepends=True)[:kept]))
+    assert (f"frames.jsonl: {fault}" in text_of(run_folder)) == (fault is not None)
+    assert main(["plot", str(run_folder)]) == 0
+    assert (f"frames.jsonl: {fault}" in capsys.readouterr().err) == (fault is not None)
+
+
+def test_damaged_rows_are_counted_and_the_rest_is_described(run_folder):
+    rows = run_folder / "frames.jsonl"
+    first, second, *others = rows.read_text().splitlines(keepends=True)
+    rows.write_text("".join([first, second[:30] + "\n", *others]))
+    text = text_of(run_folder)
+    assert f"frames.jsonl: damaged lines: 1, the first: {rows}:2 is not a frame row" in text
+    assert "trajectory.tum: " in text
+
+
 def test_all_files_that_exports_and_viewers_read_are_listed(run_folder):
     (run_folder / "dense.ply").write_bytes(bytes(2048))
     assert "dense.ply: 2.0 KiB" in text_of(run_folder)

@@ -183,12 +183,25 @@ def describe_run(path: Path) -> list[Section]:
         )
     if line := parts_line(parts):
         facts.append(("parts", line))
+    facts += _row_faults(path, summary)
     files = [(file.name, _bytes(file.stat().st_size)) for file in files_of_run(path)]
     images = read_image_paths(path)
     if images:
         files.append(("images/", f"{len(images)} decoded images"))
     versions = [(name, str(value)) for name, value in (summary.get("versions") or {}).items()]
     return [(f"run {path}", facts), ("files", files), ("made with", versions)]
+
+
+def _row_faults(path: Path, summary: dict[str, Any]) -> list[tuple[str, str]]:
+    """Say what is wrong with the rows of a run, if anything is."""
+    from semcast.server.frame_rows import RowsOnDisk
+
+    there = RowsOnDisk.read(path / FRAMES_NAME)
+    num_tracked = (summary.get("frames") or {}).get("tracked")
+    texts = there.missing(num_tracked if isinstance(num_tracked, int) else None)
+    if bad := there.bad:
+        texts.append(f"damaged lines: {len(bad)}, the first: {bad[0]}")
+    return [(FRAMES_NAME if k == 0 else "", text) for k, text in enumerate(texts)]
 
 
 def _figures(summary: dict[str, Any]) -> list[tuple[str, str]]:
