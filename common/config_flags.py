@@ -7,6 +7,7 @@ them without the table, by their flag: ``snr_db = 4`` is ``[link]`` with ``snr_d
 import argparse
 import dataclasses
 import operator
+import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args, get_origin
@@ -136,6 +137,11 @@ def _table(values: dict[str, Any], path: Sequence[str]) -> dict[str, Any]:
     return values
 
 
+def _is_table(annotation: Any, value: Any) -> bool:
+    """Whether a value in a file is a table of nested settings."""
+    return isinstance(value, Mapping) and nested_settings(annotation) is not None
+
+
 def _into_tables(cls: type, given: Mapping[str, Any], skip: frozenset[str]) -> dict[str, Any]:
     """Move what a file names by its flag into the table of the setting; the rest stays where it is.
 
@@ -147,8 +153,7 @@ def _into_tables(cls: type, given: Mapping[str, Any], skip: frozenset[str]) -> d
     values: dict[str, Any] = {}
     named_by_flag: dict[str, Any] = {}
     for key, value in given.items():
-        is_table = isinstance(value, Mapping) and nested_settings(annotations.get(key)) is not None
-        if key in flags and not is_table:
+        if key in flags and not _is_table(annotations.get(key), value):
             named_by_flag[key] = value
         elif key in annotations:
             values[key] = value
@@ -162,17 +167,38 @@ def _into_tables(cls: type, given: Mapping[str, Any], skip: frozenset[str]) -> d
     return values
 
 
-def _values_in(config: Path, cls: type, skip: frozenset[str]) -> dict[str, Any]:
-    """Return the checked values of a settings file.
+def _renamed(message: str, written: Mapping[str, str]) -> str:
+    """Call a setting that a message begins with, or an entry of it, what the user has written."""
+    found = re.match(r"[\w.]+", message)
+    name = found.group() if found else ""
+    return written.get(name, name) + message[len(name) :]
+
+
+def _values_in(config: Path, cls: type, skip: frozenset[str]) -> tuple[dict[str, Any], dict[str, str]]:
+    """Return the checked values of a settings file, and what it calls each: dotted name -> key.
 
     Raises:
-        ConfigError: See ``given_values``; the message names the file.
+        ConfigError: See ``given_values``; the message names the file, and settings as it does.
     """
-    given = read_toml(config)
+    given, annotations = read_toml(config), types_of(cls)
+    at_top = {key for key, value in given.items() if not _is_table(annotations.get(key), value)}
+    flags = list(_flags_of(cls, skip))
+    keys = {flag.dotted: flag.name for flag in flags if flag.name in at_top}
     try:
-        return check_values(cls, _into_tables(cls, given, skip))
+        values = check_values(cls, _into_tables(cls, given, skip))
     except ConfigError as err:
-        raise ConfigError(f"{config}: {err}") from err
+        raise ConfigError(f"{config}: {_renamed(str(err), keys)}") from err
+    return values, {
+        flag.dotted: keys.get(flag.dotted, flag.dotted) for flag in flags if _holds(values, flag.dotted)
+    }
+
+
+def _holds(values: Mapping[str, Any], dotted: str) -> bool:
+    """Whether there is a value of this name in the tables of a file."""
+    first, _, rest = dotted.partition(".")
+    if not rest:
+        return first in values
+    return isinstance(table := values.get(first), Mapping) and _holds(table, rest)
 
 
 def given_values(
@@ -193,13 +219,31 @@ def given_values(
     Raises:
         ConfigError: See ``check_values`` and ``read_toml``; or a file gives one setting two values.
     """
-    values = {} if config is None else _values_in(config, cls, skip)
+    return _given(cls, arguments, config, skip)[0]
+
+
+def _given(
+    cls: type, arguments: argparse.Namespace, config: Path | None, skip: frozenset[str]
+) -> tuple[dict[str, Any], dict[str, str]]:
+    """Return what was given, see ``given_values``, and how the user has written it.
+
+    The latter is by the name that a setting has in errors of ``build_settings``, its flag's without dashes.
+    """
+    values, keys = ({}, {}) if config is None else _values_in(config, cls, skip)
+    written: dict[str, str] = {}
+    shown: dict[str, str] = {}
     for flag in _flags_of(cls, skip):
         value = getattr(arguments, flag.dotted, None)
         if value is not None:
             *tables, key = flag.dotted.split(".")
             _table(values, tables)[key] = value
-    return check_values(cls, values)
+            written[flag.name] = shown[flag.dotted] = flag.shown
+        elif flag.dotted in keys:
+            written[flag.name] = f"{config}: {keys[flag.dotted]}"
+    try:
+        return check_values(cls, values), written
+    except ConfigError as err:
+        raise ConfigError(_renamed(str(err), shown)) from err
 
 
 def settings_from(
@@ -211,14 +255,18 @@ def settings_from(
     """Merge defaults, a TOML file and flags, in this order, into a settings object; see ``given_values``.
 
     Raises:
-        ConfigError: See ``given_values`` and ``build_settings``.
+        ConfigError: See ``given_values`` and ``build_settings``; the error names the setting as it was given:
+            its flag, or the file and the name it has there.
         MissingSettingError: A value without a default was not given; the error names its flag.
     """
+    values, written = _given(cls, arguments, config, skip)
     try:
-        return build_settings(cls, given_values(cls, arguments, config, skip))
+        return build_settings(cls, values)
     except MissingSettingError as err:
         shown = {flag.dotted: flag.shown for flag in _flags_of(cls, skip)}
         raise MissingSettingError(shown.get(err.name, err.name)) from err
+    except ConfigError as err:
+        raise ConfigError(_renamed(str(err), written)) from err
 
 
 def flag_words(

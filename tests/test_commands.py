@@ -219,7 +219,7 @@ def test_a_trace_of_this_folder_is_found_by_a_channel_in_another(channel, tmp_pa
     ("text", "message"),
     [
         ("snr_bd = 3", "unknown setting 'snr_bd', did you mean 'snr_db'"),
-        ("snr_db = 'low'", "link.snr_db must be of type float, got 'low'"),
+        ("snr_db = 'low'", "settings.toml: snr_db must be of type float, got 'low'"),
         ("snr_db = nan", "snr_db must be in [-5, 30], got nan"),
         ("jitter_ms = inf", "jitter_ms must be in [0, 10000], got inf"),
         ("", "set needs a value to change"),

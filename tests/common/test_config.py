@@ -208,12 +208,12 @@ def test_flags_win_over_a_file_that_names_settings_by_their_flag(toml):
         (Sender, "expect_snr_db = 4\nsnr_db = 5", "expect_snr_db and snr_db are one setting, got 4 and 5"),
         (Node, "snr_db = nan", "snr_db must be in [-5, 30], got nan"),
         (Sender, 'camera = "0"\nexpect_snr_db = 99.0', "expect_snr_db must be in [-5, 30], got 99.0"),
-        (Sender, 'camera = "0"\nfx = "far"', "camera.lens.fx must be of type float, got 'far'"),
+        (Sender, 'camera = "0"\nfx = "far"', ": fx must be of type float, got 'far'"),
         (Node, "snr_bd = 4", "unknown setting 'snr_bd', did you mean 'snr_db'"),
         (Sender, "exepct_snr = 4", "unknown setting 'exepct_snr', did you mean 'expect_snr_db'"),
         (Node, 'radio = "awgn"', "radio must be a table of settings, got 'awgn'"),
         (Node, 'radio = "awgn"\nsnr_db = 4', "radio must be a table of settings, got 'awgn'"),
-        (Node, "[snr_db]\nvalue = 4", "radio.snr_db must be of type float, got {'value': 4}"),
+        (Node, "[snr_db]\nvalue = 4", ": snr_db must be of type float, got {'value': 4}"),
         (Sender, "[camera]\ncamera = '0'\nlens = 3", "camera.lens must be a table of settings, got 3"),
     ],
 )
@@ -223,14 +223,36 @@ def test_a_file_that_contradicts_itself_or_the_settings_is_one_clear_error(toml,
 
 
 @pytest.mark.parametrize(
-    "text", ["snr_bd = 4", 'snr_db = "4"', "snr_db = 4\n[radio]\nsnr_db = 5", "snr_db = "]
+    ("cls", "text", "message"),
+    [
+        (Node, "snr_bd = 4", "unknown setting 'snr_bd'"),
+        (Node, 'snr_db = "4"', "snr_db must be of type float, got '4'"),
+        (Node, '[radio]\nsnr_db = "4"', "radio.snr_db must be of type float, got '4'"),
+        (Node, "levels = [1, true]", "levels[1] must be of type float, got True"),
+        (Node, "snr_db = 99", "snr_db must be in [-5, 30], got 99.0"),
+        (Node, "[radio]\nsnr_db = 99", "radio.snr_db must be in [-5, 30], got 99.0"),
+        (Sender, 'snr_db = 99\ncamera = "0"', "snr_db must be in [-5, 30], got 99.0"),
+        (Sender, 'expect_snr_db = 99\n[camera]\ncamera = "0"', "expect_snr_db must be in [-5, 30]"),
+        (Sender, "[camera]\ncamera = 0", "camera.camera must be of type str, got 0"),
+        (Sender, "camera = 0", "camera must be of type str, got 0"),
+    ],
 )
-def test_what_is_wrong_in_a_file_is_said_with_its_name_and_what_is_wrong_in_a_flag_without(toml, text):
+def test_what_is_wrong_in_a_file_is_said_with_its_name_and_the_key_in_it(toml, cls, text, message):
     file = toml(text)
-    with pytest.raises(ConfigError, match=f"^{re.escape(str(file))}"):
-        parse([], file)
-    with pytest.raises(ConfigError, match="^snr_db must be in"):
+    with pytest.raises(ConfigError) as error:
+        parse([], file, cls)
+    assert str(error.value).startswith(f"{file}: {message}")
+
+
+def test_what_is_wrong_in_a_flag_is_said_with_the_flag_whatever_is_in_the_file(toml):
+    with pytest.raises(ConfigError, match="^--snr-db must be in"):
         parse(["--snr-db", "99"], toml("snr_db = 4"))
+    with pytest.raises(ConfigError, match="^--expect-snr-db must be in"):
+        parse(["--expect-snr-db", "99", "--camera", "0"], cls=Sender)
+    with pytest.raises(ConfigError, match="^--out must be the name of a file"):
+        parse(["--out", ""], toml("snr_db = 4"))
+    with pytest.raises(ConfigError, match="^FILE must be the name of a file"):
+        parse(["", "--camera", "0"], cls=Sender)
 
 
 @pytest.mark.parametrize(

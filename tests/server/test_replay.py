@@ -473,14 +473,14 @@ def test_a_time_range_without_frames_is_one_clear_error(recording, tmp_path):
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        (["--start-s", "nan"], "start_s must be at least 0 and finite, got nan"),
-        (["--start-s", "-1"], "start_s must be at least 0 and finite, got -1"),
-        (["--end-s", "nan"], "end_s must be later than start_s (0), got nan"),
-        (["--save-images", "all"], "save_images needs out, got save_images='all' without a folder"),
-        (["--fx", "9", "--fy", "9", "--cx", "9", "--cy", "9"], "fx is of the camera of the reference"),
-        (["--seed", "-1"], "seed must be in [0, 2147483647], got -1"),
-        (["--threads", "99999"], "threads must be in [1, 1024], got 99999"),
-        (["--out", ""], "out must be the name of a file or folder, got ''"),
+        (["--start-s", "nan"], "--start-s must be at least 0 and finite, got nan"),
+        (["--start-s", "-1"], "--start-s must be at least 0 and finite, got -1"),
+        (["--end-s", "nan"], "--end-s must be later than start_s (0), got nan"),
+        (["--save-images", "all"], "--save-images needs out, got save_images='all' without a folder"),
+        (["--fx", "9", "--fy", "9", "--cx", "9", "--cy", "9"], "--fx is of the camera of the reference"),
+        (["--seed", "-1"], "--seed must be in [0, 2147483647], got -1"),
+        (["--threads", "99999"], "--threads must be in [1, 1024], got 99999"),
+        (["--out", ""], "--out must be the name of a file or folder, got ''"),
     ],
 )
 def test_settings_that_can_not_be_are_one_clear_error(recording, words, text, capsys):
