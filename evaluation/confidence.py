@@ -12,8 +12,10 @@ from semcast.evaluation.confidence_grades import KeypointGrader, PixelGrader, Sl
 from semcast.evaluation.interruption import until_interrupted
 from semcast.evaluation.pipeline import (
     CLEAN,
+    ORIGINALS_BYTES,
     UNUSED_LINK_FIELDS,
     FrameRun,
+    Selection,
     StreamSettings,
     open_stream,
     select_frames,
@@ -70,11 +72,11 @@ def evaluate_confidence(settings: ConfidenceSettings, codec: Codec | None = None
     """
     settings = naming(settings, codec)
     sequence, codec = open_stream(settings, codec)
-    chosen = select_frames(sequence, settings)
+    chosen = select_frames(sequence, settings, keep_bytes=ORIGINALS_BYTES)
     results: list[dict[str, Any]] = []
     with until_interrupted(results) as part:
         for snr_db in settings.snr_db:
-            results.append(_grade_at(settings, sequence, chosen.ids, codec, snr_db))
+            results.append(_grade_at(settings, sequence, chosen, codec, snr_db))
     report = write_result(
         settings.json,
         {
@@ -98,7 +100,7 @@ def evaluate_confidence(settings: ConfidenceSettings, codec: Codec | None = None
 def _grade_at(
     settings: ConfidenceSettings,
     sequence: RecordedSequence,
-    frame_ids: list[int],
+    chosen: Selection,
     codec: Codec | None,
     snr_db: float,
 ) -> dict[str, Any]:
@@ -106,7 +108,8 @@ def _grade_at(
     quality_db: list[float] = []
     num_lost = 0
     for seed in settings.all_seeds:
-        run = FrameRun(sequence, frame_ids, codec, settings.link_at(snr_db), seed, cache_bytes=0)
+        link, images = settings.link_at(snr_db), chosen.images
+        run = FrameRun(sequence, chosen.ids, codec, link, seed, images=images, cache_bytes=0)
         for frame in run:
             if frame.decoded is None or frame.row_snr_db is None:
                 num_lost += 1
@@ -115,12 +118,12 @@ def _grade_at(
             pixel.add(frame.decoded, frame.original)
             keypoint.add(frame.decoded, frame.original)
             slots.add(frame.decoded, frame.row_snr_db)
-    if num_lost == len(frame_ids) * settings.seeds:
+    if num_lost == len(chosen.ids) * settings.seeds:
         level = snr_label(snr_db, settings.link)
         raise ConfigError(f"no frame was received at {level}: there is no confidence to grade")
     return {
         "snr_db": stated_snr_db(snr_db, settings.link),
-        "num_frames": len(frame_ids) * settings.seeds,
+        "num_frames": len(chosen.ids) * settings.seeds,
         "num_frames_lost": num_lost,
         "psnr_db": finite_mean(quality_db),
         "pixel": pixel.result(),

@@ -30,6 +30,7 @@ from semcast.evaluation.pair_methods import (
     match_confidence,
 )
 from semcast.evaluation.pipeline import (
+    ORIGINALS_BYTES,
     UNUSED_LINK_FIELDS,
     FrameRun,
     LinkedFrame,
@@ -155,7 +156,7 @@ def evaluate_pairs(settings: PairSettings, codec: Codec | None = None) -> dict[s
     """
     settings = naming(settings, codec)
     sequence, codec = open_stream(settings, codec)
-    chosen = select_frames(sequence, settings)
+    chosen = select_frames(sequence, settings, keep_bytes=ORIGINALS_BYTES)
     motions = {gap: true_motions(sequence, chosen.ids, settings, gap) for gap in settings.gap}
     methods = [*settings.confidence, *((*COMPETITORS, ORACLE) if settings.competitors else ())]
     # Without a link the SNR changes nothing: one cell stands for all.
@@ -168,7 +169,7 @@ def evaluate_pairs(settings: PairSettings, codec: Codec | None = None) -> dict[s
     with until_interrupted(cells) as part:
         for snr_db, seed in product(snrs_db, settings.all_seeds):
             link = settings.link_at(snr_db) if snr_db is not None else settings.link
-            run = FrameRun(sequence, chosen.ids, codec, link, seed, cache_bytes=0)
+            run = FrameRun(sequence, chosen.ids, codec, link, seed, images=chosen.images, cache_bytes=0)
             of_run = _pairs(run, settings.gap, motions, sequence.intrinsics, quality_db[snr_db])
             for gap, pair_idx, pair in of_run:
                 for variant, outcome in _measure(pair, gap, settings, seed):

@@ -6,7 +6,7 @@ frame number alone. It is the same codec, link and equaliser the processes run.
 
 import logging
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -49,6 +49,8 @@ UNUSED_IN_ONE_RUN = UNUSED_LINK_FIELDS | {"reconstruction.seed", "reconstruction
 
 #: Decoded frames kept for further passes; beyond it frames are sent and decoded again.
 CACHE_BYTES = 2 * 1024**3
+#: Original images kept from when the frames were chosen; those beyond it are read again for each pass.
+ORIGINALS_BYTES = 256 * 1024**2
 
 
 def check_seeds(seed: int, seeds: int = 1) -> None:
@@ -188,14 +190,22 @@ class Selection:
     Attributes:
         ids: Indices in the recording, increasing.
         left_out: Those that were chosen and whose image can't be read: an agent leaves them out as well.
+        images: Index -> image, ``(H, W, 3)`` uint8 RGB, of those that were kept when they were read.
     """
 
     ids: list[int]
     left_out: list[int]
+    images: dict[int, NDArray[np.uint8]]
 
 
-def select_frames(sequence: RecordedSequence, settings: StreamSettings) -> Selection:
+def select_frames(sequence: RecordedSequence, settings: StreamSettings, *, keep_bytes: int = 0) -> Selection:
     """Return the frames that ``start``, ``stride`` and ``max_frames`` choose; what can't be read is left out.
+
+    Args:
+        sequence: The recording.
+        settings: What chooses them.
+        keep_bytes: Of their images the first are kept, as far as they fit in. An evaluation that measures its
+            own memory keeps none.
 
     Raises:
         ConfigError: None is chosen.
@@ -207,19 +217,26 @@ def select_frames(sequence: RecordedSequence, settings: StreamSettings) -> Selec
             f"start must be below the {len(sequence)} frames of the sequence, got {settings.start}"
         )
     left_out: list[int] = []
+    images: dict[int, NDArray[np.uint8]] = {}
     for frame_id in (ids := ids[: settings.max_frames]):
         try:
-            sequence.image(frame_id)
+            image = sequence.image(frame_id)
+            if (len(images) + 1) * image.nbytes <= keep_bytes:  # all are of one size
+                images[frame_id] = image
         except SourceError as err:
             if len(left_out) == len(ids) - 1:
                 raise
             logger.warning("frame %d is left out: %s", frame_id, err)
             left_out.append(frame_id)
-    return Selection([frame_id for frame_id in ids if frame_id not in left_out], left_out)
+    return Selection([frame_id for frame_id in ids if frame_id not in left_out], left_out, images)
 
 
 def run_frames(
-    sequence: RecordedSequence, frame_ids: Sequence[int], codec: Codec | None, link: Link | None
+    sequence: RecordedSequence,
+    frame_ids: Sequence[int],
+    codec: Codec | None,
+    link: Link | None,
+    images: Mapping[int, NDArray[np.uint8]] | None = None,
 ) -> Iterator[LinkedFrame]:
     """Send frames of a recording through a codec and a link, one after the other.
 
@@ -231,6 +248,7 @@ def run_frames(
         frame_ids: Frames to send, increasing.
         codec: Both ends; None together with ``link`` gives the originals with confidence 1.
         link: The channel.
+        images: Of frames whose image need not be read again.
 
     Raises:
         ValueError: Only one of ``codec`` and ``link`` is given.
@@ -241,7 +259,7 @@ def run_frames(
     reporter = LinkReporter(codec.name) if codec is not None else None
     feedback_db: float | None = None
     for frame_id in frame_ids:
-        original = sequence.image(frame_id)
+        original = images[frame_id] if images and frame_id in images else sequence.image(frame_id)
         t_source_ns = int(sequence.times_ns[frame_id])
         if codec is None or link is None or reporter is None:
             clean = DecodedImage(original, np.ones(original.shape[:2], dtype=np.float32))
@@ -290,6 +308,7 @@ class FrameRun:
         codec: Both ends, or None for clean originals.
         link: Settings of the channel.
         seed: Seed of the channel.
+        images: Of frames whose image need not be read again, as ``select_frames`` keeps them.
         cache_bytes: Memory budget; 0 keeps nothing.
     """
 
@@ -301,6 +320,7 @@ class FrameRun:
         link: ChannelSettings,
         seed: int,
         *,
+        images: Mapping[int, NDArray[np.uint8]] | None = None,
         cache_bytes: int = CACHE_BYTES,
     ) -> None:
         self._sequence = sequence
@@ -308,6 +328,7 @@ class FrameRun:
         self._codec = codec
         self._link = link
         self._seed = seed
+        self._images = images
         self._cache_bytes = cache_bytes
         self._kept: list[LinkedFrame] | None = None
 
@@ -322,7 +343,7 @@ class FrameRun:
         link = Link(self._link, self._seed) if self._codec is not None else None
         kept: list[LinkedFrame] | None = []
         num_bytes = 0
-        for frame in run_frames(self._sequence, self._frame_ids, self._codec, link):
+        for frame in run_frames(self._sequence, self._frame_ids, self._codec, link, self._images):
             num_bytes += frame.num_bytes
             if num_bytes > self._cache_bytes:
                 kept = None

@@ -17,6 +17,7 @@ from semcast.evaluation.gap import Gap, gap_in, outside, recovery_s
 from semcast.evaluation.interruption import until_interrupted
 from semcast.evaluation.pipeline import (
     CLEAN,
+    ORIGINALS_BYTES,
     UNUSED_LINK_FIELDS,
     FrameRun,
     StreamSettings,
@@ -124,7 +125,7 @@ def evaluate_trajectory(settings: TrajectorySettings, codec: Codec | None = None
     if doubt := sequence.doubt:
         logger.warning("%s is %s", sequence.name, doubt)
     has_truth = _is_usable(truth, sequence.name, len(sequence))
-    chosen = select_frames(sequence, settings)
+    chosen = select_frames(sequence, settings, keep_bytes=ORIGINALS_BYTES)
     # Without a link neither SNR nor channel seed changes an image: one SNR stands for all.
     snrs_db = settings.snr_db if codec is not None else settings.snr_db[:1]
     runs: dict[tuple[float, str], list[dict[str, Any]]] = {}
@@ -133,7 +134,7 @@ def evaluate_trajectory(settings: TrajectorySettings, codec: Codec | None = None
         for snr_db, seed in product(snrs_db, settings.all_seeds):
             gap = gap_in(chosen.ids, sequence.times_ns, settings.gap_s, seed) if settings.gap_s else None
             ids = chosen.ids if gap is None else outside(chosen.ids, gap)
-            frames = FrameRun(sequence, ids, codec, settings.link_at(snr_db), seed)
+            frames = FrameRun(sequence, ids, codec, settings.link_at(snr_db), seed, images=chosen.images)
             for mode in settings.confidence:
                 how = replace(settings.reconstruction, confidence=mode, seed=seed)
                 run = reconstruct(frames, sequence.intrinsics, how, truth)

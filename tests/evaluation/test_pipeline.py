@@ -133,6 +133,26 @@ def test_start_stride_and_limit_choose_frames(room, sequence):
         select_frames(sequence, StreamSettings(sequence=room, start=24))
 
 
+def test_an_image_that_was_kept_when_it_was_chosen_is_not_read_again(room, sequence, monkeypatch):
+    read, read_image = [], type(sequence).image
+
+    def image(self, index, camera=None):
+        read.append(index)
+        return read_image(self, index, camera)
+
+    settings, size = StreamSettings(sequence=room, max_frames=4), sequence.image(0).nbytes
+    monkeypatch.setattr(type(sequence), "image", image)
+    chosen = select_frames(sequence, settings, keep_bytes=3 * size)
+    assert (read, list(chosen.images)) == ([0, 1, 2, 3], [0, 1, 2])
+    read.clear()
+    run = FrameRun(sequence, chosen.ids, None, ChannelSettings(), 0, images=chosen.images, cache_bytes=0)
+    kept = [frame.original for frame in run]
+    assert read == [3]
+    for frame_id, original in enumerate(kept):
+        np.testing.assert_array_equal(original, sequence.image(frame_id))
+    assert not select_frames(sequence, settings).images
+
+
 def test_frames_that_can_not_be_read_are_told_and_left_out(room, tmp_path, caplog):
     shutil.copytree(room, tmp_path / "room")
     images = sorted((tmp_path / "room" / "images").iterdir())
