@@ -1,8 +1,8 @@
 """What confidence does to paths, link by link over all recordings: another part of ``docs/confidence.md``.
 
 A row of one recording tells mostly chance. Over many recordings it averages out, and what is left tells where
-confidence is worth something. A recording counts once, however many runs it has: runs over one recording
-share its views, and are alike for that.
+confidence is worth something. A recording counts once, however many runs and files it has: runs over one
+recording share its views, and are alike for that.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.codec import DEFAULT_CODEC
-from semcast.evaluation.markdown import table
-from semcast.evaluation.statistics import MIN_SAMPLES, scatter_of_mean
+from semcast.evaluation.markdown import table, with_interval
+from semcast.evaluation.statistics import MIN_SAMPLES, mean_ratio
 from semcast.evaluation.trajectory_summary import LEAST_ERROR, paired_runs
 
 Array = NDArray[np.float64]
@@ -30,7 +30,6 @@ FIGURES = {
 }
 #: Runs of a recording over one link from which it counts.
 _MIN_RUNS = 3
-_SEED = 0
 
 
 @dataclass(frozen=True)
@@ -61,21 +60,23 @@ def compare_links(reports: Iterable[Report]) -> list[LinkComparison]:
     Returns:
         By channel, then SNR.
     """
-    found: dict[tuple[str, float], list[Array]] = {}
+    found: dict[tuple[str, float], dict[str, list[Array]]] = {}
     for report in reports:
         settings = report["settings"]
         is_other = settings["codec"] != DEFAULT_CODEC or settings.get("gap_s")
         if is_other or settings["link"].get("doppler_hz"):
             continue
         for snr_db, shared in paired_runs(report):
-            logs = _log_ratios(shared)
-            if len(logs) >= _MIN_RUNS:
-                found.setdefault((settings["link"]["channel"], snr_db), []).append(logs)
-    return [
-        LinkComparison(*link, sum(map(len, of_link)), np.stack([logs.mean(axis=0) for logs in of_link]))
-        for link, of_link in sorted(found.items())
-        if len(of_link) >= MIN_SAMPLES
-    ]
+            of_link = found.setdefault((settings["link"]["channel"], snr_db), {})
+            of_link.setdefault(report["sequence"], []).append(_log_ratios(shared))
+    compared = []
+    for (channel, snr_db), of_link in sorted(found.items()):
+        runs = [np.concatenate(logs) for logs in of_link.values()]
+        runs = [logs for logs in runs if len(logs) >= _MIN_RUNS]
+        if len(runs) >= MIN_SAMPLES:
+            means = np.stack([logs.mean(axis=0) for logs in runs])
+            compared.append(LinkComparison(channel, snr_db, sum(map(len, runs)), means))
+    return compared
 
 
 def link_summary(reports: Iterable[Report]) -> str:
@@ -94,18 +95,11 @@ def _lines(links: Sequence[LinkComparison]) -> Iterator[str]:
                 f"{link.channel}, {link.snr_db:g} dB",
                 len(link.log_ratios),
                 link.num_runs,
-                *(_with_interval(logs) for logs in link.log_ratios.T),
+                *(with_interval(*mean_ratio([logs])) for logs in link.log_ratios.T),
             )
             for link in links
         ],
     )
-
-
-def _with_interval(log_ratios: Array) -> str:
-    mean = log_ratios.mean()
-    off = scatter_of_mean(log_ratios, np.random.default_rng(_SEED))
-    low, high = np.exp(mean + np.percentile(off, [2.5, 97.5]))
-    return f"{np.exp(mean):.2f} ({low:.2f} .. {high:.2f})"
 
 
 def _log_ratios(shared: Sequence[tuple[Report, Report]]) -> Array:

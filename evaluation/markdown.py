@@ -11,6 +11,11 @@ def number(value: Any, digits: int = 2) -> str:
     return f"{value:.{digits}f}" if isinstance(value, float) else str(value)
 
 
+def with_interval(value: float, low: float, high: float) -> str:
+    """Return a figure and the interval it is in as text."""
+    return f"{value:.2f} ({low:.2f} .. {high:.2f})"
+
+
 def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> Iterator[str]:
     """Yield the lines of a Markdown table."""
     yield "| " + " | ".join(head) + " |"

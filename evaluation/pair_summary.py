@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.codec import DEFAULT_CODEC
-from semcast.evaluation.markdown import number, table
+from semcast.evaluation.markdown import number, table, with_interval
 from semcast.evaluation.pair_suite import RECORDINGS
 from semcast.evaluation.pipeline import CLEAN
-from semcast.evaluation.statistics import MIN_SAMPLES, finite_mean, scatter_of_mean
+from semcast.evaluation.statistics import MIN_SAMPLES, finite_mean, mean_ratio
 
 Array = NDArray[np.float64]
 
@@ -50,7 +50,6 @@ _RATIOS = (
     ("inverted", "off"),
     ("robust", "shuffled"),
 )
-_SEED = 0
 
 
 @dataclass(frozen=True)
@@ -420,9 +419,6 @@ def ratio_text(cells: Iterable[Cell], ours: str, theirs: str) -> str:
     logs = _log_ratios(cells, ours, theirs)
     if not len(logs):
         return "-"
-    ratio = f"{np.exp(logs.mean()):.2f}"
     if len(logs) < MIN_SAMPLES:
-        return ratio
-    off = scatter_of_mean(logs, np.random.default_rng(_SEED))
-    low, high = np.exp(logs.mean() + np.percentile(off, [2.5, 97.5]))
-    return f"{ratio} ({low:.2f} .. {high:.2f})"
+        return f"{np.exp(logs.mean()):.2f}"
+    return with_interval(*mean_ratio([logs]))

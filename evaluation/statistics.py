@@ -17,6 +17,7 @@ Array = NDArray[np.float64]
 NUM_RESAMPLES = 2000
 #: Resamples behind an interval in a table of a page, of which there are few: the second digit is then steady.
 _NUM_PAGE_RESAMPLES = 4000
+_PAGE_SEED = 0
 #: Samples from which an interval is given.
 MIN_SAMPLES = 5
 
@@ -182,6 +183,26 @@ def scatter_of_mean(values: Array, rng: np.random.Generator) -> Array:
     factor, size = small_sample_factor(len(values)), (_NUM_PAGE_RESAMPLES, len(values))
     off = values[rng.integers(len(values), size=size)].mean(axis=1) - values.mean()
     return np.asarray(factor * off)
+
+
+def mean_ratio(log_ratios: Sequence[Array]) -> tuple[float, float, float]:
+    """Return the geometric mean of ratios, all groups of them alike, and its 95 % bootstrap interval.
+
+    Args:
+        log_ratios: Logarithms ``(N,)`` of the ratios of each group, at least 5; each group is resampled by
+            itself.
+
+    Returns:
+        The mean, and the bounds of the interval, which are the same at each call.
+
+    Raises:
+        ValueError: As ``small_sample_factor``.
+    """
+    rng = np.random.default_rng(_PAGE_SEED)
+    off = np.mean([scatter_of_mean(logs, rng) for logs in log_ratios], axis=0)
+    mean = np.mean([logs.mean() for logs in log_ratios])
+    low, high = np.exp(mean + np.percentile(off, [2.5, 97.5]))
+    return float(np.exp(mean)), float(low), float(high)
 
 
 def _checked_pair(

@@ -11,16 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from semcast.evaluation.markdown import number, table
-from semcast.evaluation.statistics import MIN_SAMPLES, scatter_of_mean
+from semcast.evaluation.markdown import number, table, with_interval
+from semcast.evaluation.statistics import MIN_SAMPLES, mean_ratio
 
 Array = NDArray[np.float64]
 Report = Mapping[str, Any]
 
 #: Least error, in whatever unit: one of exactly 0 has no logarithm.
 LEAST_ERROR = 1e-6
-
-_SEED = 0
 
 
 @dataclass(frozen=True)
@@ -84,12 +82,7 @@ def pairings_of(reports: Iterable[Report]) -> list[Pairing]:
 
 def ratio_interval(pairings: Sequence[Pairing]) -> tuple[float, float, float]:
     """Return the geometric mean ratio of errors, all cells alike, and its 95 % bootstrap interval."""
-    rng = np.random.default_rng(_SEED)
-    logs = [np.log(p.ours_percent / p.theirs_percent) for p in pairings]
-    off = np.mean([scatter_of_mean(log, rng) for log in logs], axis=0)
-    mean = np.mean([log.mean() for log in logs])
-    low, high = np.exp(mean + np.percentile(off, [2.5, 97.5]))
-    return float(np.exp(mean)), float(low), float(high)
+    return mean_ratio([np.log(p.ours_percent / p.theirs_percent) for p in pairings])
 
 
 def trajectory_summary(reports: Iterable[Report]) -> str:
@@ -113,13 +106,16 @@ def _lines(pairings: Sequence[Pairing]) -> Iterator[str]:
             for values, posed in sides
             for text in (number(float(np.median(values))), number(float(values.max())), f"{posed:.1%}")
         ]
-        rows.append([p.title, str(len(p.ours_percent)), str(p.num_failed), *figures, _with_interval([p])])
+        rows.append(
+            [
+                p.title,
+                str(len(p.ours_percent)),
+                str(p.num_failed),
+                *figures,
+                with_interval(*ratio_interval([p])),
+            ]
+        )
     names = (f"{mode}, {what}" for mode in ("robust", "off") for what in ("median", "worst", "posed"))
     head = ["recording, link", "runs", "failed", *names, "ratio"]
     yield from table(head, rows)
-    yield f"\nOver all {len(pairings)} rows: {_with_interval(pairings)}."
-
-
-def _with_interval(pairings: Sequence[Pairing]) -> str:
-    ratio, low, high = ratio_interval(pairings)
-    return f"{ratio:.2f} ({low:.2f} .. {high:.2f})"
+    yield f"\nOver all {len(pairings)} rows: {with_interval(*ratio_interval(pairings))}."

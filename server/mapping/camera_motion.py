@@ -158,7 +158,7 @@ class CameraMotion:
             return []
         since_ns, T_world_moving = self._moving
         moved, expected = self._displacements(T_world_moving, (T_world_cam, T_world_go), xyz)
-        moved_px, expected_px = _length(moved), _length(expected)
+        (moved_px, most_px), (expected_px, most_expected_px) = _lengths(moved), _lengths(expected)
         if not self._still and expected_px < _LEAST_EXPECTED_PX:
             self._go_on(t_source_ns, T_world_cam)
             return []
@@ -166,14 +166,13 @@ class CameraMotion:
         before_ns = self._still_ns if self._still else since_ns
         known_ns = min(t_source_ns - since_ns, round(MAX_EXTRAPOLATION_S / _S_PER_NS))
         steps = known_ns / max(1, t_source_ns - before_ns)
-        step_px = expected_px / max(1.0, steps)
-        most_px, most_expected_px = (_length(m, _STILL_QUANTILE) for m in (moved, expected))
         if most_px < _STILL_SHARE * most_expected_px / max(1.0, steps):
             self._still.append(frame_id)
             self._still_ns = t_source_ns
             return []
         withdrawn: list[int] = []
         if self._still:
+            step_px = expected_px / max(1.0, steps)
             gone = moved_px >= min(_GONE_SHARE * steps, _GONE_STEPS) * step_px
             if steps > 1.0 and gone and _cosine(moved, expected) >= _SAME_DIRECTION:
                 withdrawn = self._still
@@ -198,7 +197,7 @@ class CameraMotion:
             del self._recent[0]
         since_ns, T_world_then = self._recent[0]
         moved = self._displacements(T_world_then, [T_world_cam], xyz)[0]
-        is_near = _length(moved) <= _REST_SHARE * self._camera.width
+        is_near = _lengths(moved)[0] <= _REST_SHARE * self._camera.width
         # A camera that turned right round has no point in front of it both then and now.
         self._rests = t_source_ns - since_ns >= _REST_NS and len(moved) > 0 and is_near
 
@@ -216,9 +215,12 @@ class CameraMotion:
         return [p - pixels[0] for p in pixels[1:]]
 
 
-def _length(motion: Array, quantile: float = 0.5) -> float:
-    """A quantile of the lengths of ``motion (M, 2)``, 0 without any."""
-    return float(np.quantile(np.linalg.norm(motion, axis=1), quantile)) if len(motion) else 0.0
+def _lengths(motion: Array) -> tuple[float, float]:
+    """Median and ``_STILL_QUANTILE`` of the lengths of ``motion (M, 2)`` in pixels, 0 without any."""
+    if len(motion) == 0:
+        return 0.0, 0.0
+    median, most = np.quantile(np.linalg.norm(motion, axis=1), (0.5, _STILL_QUANTILE))
+    return float(median), float(most)
 
 
 def _cosine(a: Array, b: Array) -> float:
