@@ -34,21 +34,22 @@ def test_help_lists_every_verb_and_answers_at_once():
 
 
 @pytest.mark.parametrize(
-    ("verb", "given", "threads"),
+    ("verb", "given", "threads", "policy"),
     [
-        *((verb, {}, "1") for verb in ("agent", "server", "replay", "eval", "lens", "shutter")),
-        ("agent", {"OPENBLAS_NUM_THREADS": "3"}, "3"),
-        ("info", {}, None),
+        *((verb, {}, "1", "PASSIVE") for verb in ("agent", "server", "replay", "eval", "lens", "shutter")),
+        ("agent", {"OPENBLAS_NUM_THREADS": "3", "OMP_WAIT_POLICY": "ACTIVE"}, "3", "ACTIVE"),
+        ("info", {}, None, None),
     ],
 )
 def test_what_deals_with_frames_leaves_the_other_cores_alone_unless_told(
-    monkeypatch, capsys, verb, given, threads
+    monkeypatch, capsys, verb, given, threads, policy
 ):
-    own = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
+    names = ("OPENBLAS_NUM_THREADS", "OMP_WAIT_POLICY")
+    own = {name: value for name, value in os.environ.items() if name not in names}
     monkeypatch.setattr(os, "environ", own | given)
     with pytest.raises(SystemExit):
         main([verb, "--help"])
-    assert os.environ.get("OPENBLAS_NUM_THREADS") == threads
+    assert [os.environ.get(name) for name in names] == [threads, policy]
 
 
 @pytest.mark.parametrize("columns", [60, 80, 120])

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from _typeshed import SupportsWrite
 
 #: Verbs that go through frames: their matrices, and those of windows of keyframes, are small.
-_ONE_THREAD = frozenset({"agent", "server", "replay", "eval", "lens", "shutter"})
+_WITH_FRAMES = frozenset({"agent", "server", "replay", "eval", "lens", "shutter"})
 #: verb -> (module in semcast.commands, one line of help)
 VERBS: dict[str, tuple[str, str]] = {
     "demo": ("demo", "run agent, channel and server together on a recorded sequence and watch"),
@@ -187,14 +187,16 @@ def _quieten_libraries() -> None:
     os.environ.setdefault("RUST_LOG", "warn,re_log_encoding::rrd::file_sink=off,re_sdk::recording_stream=off")
 
 
-def _compute_in_one_thread() -> None:
-    """Let numpy's matrix products be computed in the thread that asks for them; before numpy is imported.
+def _leave_other_cores_alone() -> None:
+    """Let no thread that waits for another one spin meanwhile; before numpy and torch are imported.
 
-    OpenBLAS would share those of images wider than 950 pixels, and of adjustments, among all cores, whose
-    threads wait for each other by spinning: what takes a millisecond then takes tens of them on all cores of
-    a machine that has other work. Networks have threads of their own. What the user has set holds.
+    OpenBLAS would share products of images wider than 950 pixels, and of adjustments, among all cores, and
+    networks have threads of OpenMP: on a machine that has other work, whoever spins keeps the one that is
+    waited for from its core, and what takes a millisecond then takes many, on all cores. So numpy computes in
+    the thread that asks, and threads of networks sleep while they wait. What the user has set holds.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
 def _show_all_names() -> None:
@@ -265,9 +267,9 @@ def _run(words: list[str]) -> int:
     handler = _configure_logging(debug)
     if not debug:
         _quieten_libraries()
-    if verb in _ONE_THREAD:
-        _compute_in_one_thread()
-    if verb in _ONE_THREAD - {"agent"}:  # which may have little memory, and knows how it encodes
+    if verb in _WITH_FRAMES:
+        _leave_other_cores_alone()
+    if verb in _WITH_FRAMES - {"agent"}:  # which may have little memory, and knows how it encodes
         keep_freed_memory()
     try:
         parser = verb_parser(verb)
