@@ -16,7 +16,7 @@ from semcast.channel.awgn import noise_variance
 from semcast.channel.erasure import gilbert_elliott, independent_losses
 from semcast.channel.fading import clarke_gains, rayleigh_gains, rician_gains
 from semcast.channel.settings import ChannelSettings
-from semcast.channel.trace import ConstantTrace, RandomWalkTrace, SnrTrace, ramp, read_trace_csv
+from semcast.channel.trace import ConstantTrace, FileTrace, RandomWalkTrace, SnrTrace, ramp, read_trace_csv
 from semcast.common.config import near_match
 from semcast.common.errors import ConfigError
 
@@ -76,8 +76,8 @@ class _Model:
         del rng
         return np.ones(num_slots, dtype=np.float32)
 
-    def _lost(self, num_slots: int, rng: np.random.Generator) -> NDArray[np.bool_]:
-        del rng
+    def _lost(self, num_slots: int, elapsed_s: float, rng: np.random.Generator) -> NDArray[np.bool_]:
+        del elapsed_s, rng
         return np.zeros(num_slots, dtype=bool)
 
     def draw(self, num_slots: int, elapsed_s: float, rng: np.random.Generator) -> SlotDraw:
@@ -86,7 +86,7 @@ class _Model:
             snr_db=snr_db,
             h=self._gains(num_slots, elapsed_s, rng),
             noise_var=np.float32(noise_variance(snr_db)) * self._noise_raise(num_slots, rng),
-            lost=self._lost(num_slots, rng),
+            lost=self._lost(num_slots, elapsed_s, rng),
         )
 
 
@@ -108,7 +108,8 @@ class _Rician(_Rayleigh):
 
 
 class _Erasure(_Model):
-    def _lost(self, num_slots: int, rng: np.random.Generator) -> NDArray[np.bool_]:
+    def _lost(self, num_slots: int, elapsed_s: float, rng: np.random.Generator) -> NDArray[np.bool_]:
+        del elapsed_s
         return independent_losses(num_slots, self._settings.slot_loss, rng)
 
 
@@ -135,6 +136,13 @@ class _Trace(_Model):
 
     def snr_db(self, elapsed_s: float) -> float:
         return self._trace.snr_db(elapsed_s)
+
+    def _lost(self, num_slots: int, elapsed_s: float, rng: np.random.Generator) -> NDArray[np.bool_]:
+        share = self._trace.slot_loss(elapsed_s) if isinstance(self._trace, FileTrace) else 0.0
+        # Without losses nothing is drawn: the noise is the same as with a file that has no such column.
+        if share <= 0.0:
+            return super()._lost(num_slots, elapsed_s, rng)
+        return independent_losses(num_slots, share, rng)
 
 
 #: The models by the names that settings have.

@@ -93,7 +93,8 @@ class ChannelSettings:
         metadata={"help": "standard deviation in dB of a random walk's steps, one each half second"},
     )
     trace_file: Path | None = field(
-        default=None, metadata={"help": "CSV file with the columns t_s,snr_db (trace file)"}
+        default=None,
+        metadata={"help": "CSV file with the columns t_s,snr_db, or t_s,snr_db,slot_loss (trace file)"},
     )
     delay_ms: float = field(default=0.0, metadata={"help": "delay of every frame in ms"})
     jitter_ms: float = field(

@@ -88,8 +88,31 @@ class RandomWalkTrace:
         return (1.0 - part) * self._knots_db[k] + part * self._knots_db[k + 1]
 
 
-def read_trace_csv(path: Path) -> TableTrace:
-    """Read a trace with the columns ``t_s,snr_db``, named in a header line.
+class FileTrace(TableTrace):
+    """A recorded link: SNR and the share of slots that get lost, each linear between the rows of a file.
+
+    Its first row is the first frame's: what clock the recording had makes no difference.
+    """
+
+    def __init__(self, times_s: list[float], values_db: list[float], slot_loss: list[float]) -> None:
+        super().__init__([t_s - times_s[0] for t_s in times_s], values_db)
+        self._slot_loss = np.asarray(slot_loss, dtype=np.float64)
+
+    def slot_loss(self, elapsed_s: float) -> float:
+        """Return the share of slots lost, in [0, 1]."""
+        return float(np.interp(elapsed_s, self._times_s, self._slot_loss))
+
+
+def _numbers(row: dict[str, str], names: tuple[str, ...], where: str) -> list[float]:
+    try:
+        return [float(row[name]) for name in names]
+    except (TypeError, ValueError) as err:
+        got = ", ".join(repr(row[name]) for name in names)
+        raise ConfigError(f"{where}: {' and '.join(names)} must be numbers, got {got}") from err
+
+
+def read_trace_csv(path: Path) -> FileTrace:
+    """Read a trace with the columns ``t_s,snr_db`` and perhaps ``slot_loss``, named in a header line.
 
     Raises:
         ConfigError: The file can't be read, a column is missing, a value is no number or out of range, times
@@ -97,6 +120,7 @@ def read_trace_csv(path: Path) -> TableTrace:
     """
     times_s: list[float] = []
     values_db: list[float] = []
+    losses: list[float] = []
     low, high = SNR_RANGE_DB
     try:
         if path.exists() and not path.is_file():  # reading a pipe or device might never end
@@ -110,22 +134,21 @@ def read_trace_csv(path: Path) -> TableTrace:
             if not {"t_s", "snr_db"} <= set(names):
                 # Not what it has instead: the message may go to another machine, the file be any file.
                 raise ConfigError(f"{path} must name the columns t_s,snr_db in its first line")
+            columns = ("t_s", "snr_db", *(["slot_loss"] if "slot_loss" in names else []))
             for row in rows:
                 where = f"{path} line {rows.line_num}"
-                try:
-                    t_s, value_db = float(row["t_s"]), float(row["snr_db"])
-                except (TypeError, ValueError) as err:
-                    raise ConfigError(
-                        f"{where}: t_s and snr_db must be numbers, got {row['t_s']!r}, {row['snr_db']!r}"
-                    ) from err
+                t_s, value_db, *loss = _numbers(row, columns, where)
                 if not low <= value_db <= high:
                     raise ConfigError(f"{where}: snr_db must be in [{low:g}, {high:g}], got {value_db:g}")
+                if not all(0.0 <= share <= 1.0 for share in loss):
+                    raise ConfigError(f"{where}: slot_loss must be in [0, 1], got {loss[0]:g}")
                 if not np.isfinite(t_s) or (times_s and t_s <= times_s[-1]):
                     raise ConfigError(f"{where}: t_s must increase, got {t_s:g}")
                 times_s.append(t_s)
                 values_db.append(value_db)
+                losses.append(loss[0] if loss else 0.0)
     except (OSError, UnicodeDecodeError, csv.Error) as err:
         raise ConfigError(f"{path} can't be read as an SNR trace: {err}") from err
     if not times_s:
         raise ConfigError(f"{path} holds no rows")
-    return TableTrace(times_s, values_db)
+    return FileTrace(times_s, values_db, losses)

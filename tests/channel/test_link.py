@@ -223,6 +223,22 @@ def test_a_trace_starts_with_the_first_frame(slots):
     assert link.transmit(slots, 1239.5).snr_db_set == pytest.approx(5.0)
 
 
+def test_a_recorded_link_loses_slots_when_its_file_says_so_and_is_the_same_otherwise(slots, tmp_path):
+    file = tmp_path / "trace.csv"
+    recorded = ChannelSettings(channel="trace", trace="file", trace_file=file)
+    file.write_text("t_s,snr_db\n50,6\n60,6\n")
+    plain = Link(recorded, 0).transmit(slots, 100.0, 0)
+    file.write_text("t_s,snr_db,slot_loss\n50,6,0\n51,6,0.4\n60,6,0.4\n61,6,1\n")
+    link = Link(recorded, 0)
+    np.testing.assert_array_equal(link.transmit(slots, 100.0, 0).slots_rx, plain.slots_rx)
+    frames = [link.transmit(slots, 105.0, k) for k in range(1, 201)]
+    num = 200 * len(slots)
+    share = sum(frame.slot_lost.sum() for frame in frames) / num
+    assert abs(share - 0.4) < 4 * math.sqrt(0.4 * 0.6 / num)
+    assert not frames[0].slots_rx[frames[0].slot_lost].any()
+    assert link.transmit(slots, 112.0, 201).slot_lost.all()
+
+
 def test_bad_input_is_named(slots):
     link = Link(ChannelSettings(), 0)
     with pytest.raises(ValueError, match="must have power above 0"):

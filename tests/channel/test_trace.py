@@ -59,6 +59,16 @@ def test_a_file_is_read_and_interpolated(tmp_path, encoding):
     assert [trace.snr_db(t) for t in (0, 1.25, 2.5, 100)] == [10, 7.5, 5, -1]
 
 
+def test_a_file_on_any_clock_begins_with_the_first_frame_and_may_tell_losses(tmp_path):
+    path = tmp_path / "trace.csv"
+    path.write_text("t_s,snr_db,slot_loss\n1700000000,10,0\n1700000002,4,0.5\n1700000003,4,1\n")
+    trace = read_trace_csv(path)
+    assert [trace.snr_db(t) for t in (0, 1, 2, 9)] == [10, 7, 4, 4]
+    assert [trace.slot_loss(t) for t in (0, 1, 2, 9)] == [0, 0.25, 0.5, 1]
+    path.write_text("t_s,snr_db\n0,10\n")
+    assert read_trace_csv(path).slot_loss(5.0) == 0
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -69,6 +79,12 @@ def test_a_file_is_read_and_interpolated(tmp_path, encoding):
         ("t_s,snr_db\n0\n", r"line 2: t_s and snr_db must be numbers, got '0', None"),
         ("t_s,snr_db\n0,1\n1,99\n", r"line 3: snr_db must be in \[-5, 30\], got 99"),
         ("t_s,snr_db\n0,nan\n", r"line 2: snr_db must be in \[-5, 30\], got nan"),
+        ("t_s,snr_db,slot_loss\n0,1,1.1\n", r"line 2: slot_loss must be in \[0, 1\], got 1.1"),
+        ("t_s,snr_db,slot_loss\n0,1,nan\n", r"line 2: slot_loss must be in \[0, 1\], got nan"),
+        (
+            "t_s,snr_db,slot_loss\n0,1,\n",
+            r"line 2: t_s and snr_db and slot_loss must be numbers, got '0', '1', ''",
+        ),
         ("t_s,snr_db\n1,1\n1,2\n", "line 3: t_s must increase, got 1"),
         ("t_s,snr_db\ninf,1\n", "line 2: t_s must increase, got inf"),
     ],
