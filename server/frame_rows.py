@@ -386,8 +386,8 @@ def too_much(summary: Mapping[str, Any]) -> str | None:
     if num_skipped <= _MOST * num_sent:
         return None
     return (
-        f"the server had no time for {num_skipped} of {num_sent}; a smaller --resize or --rate-hz, or a "
-        "machine with less other work, leaves it more"
+        f"the server had no time for {num_skipped} of {num_sent}; a smaller --resize, a larger --stride or a "
+        "machine with less other work leaves it more"
     )
 
 

@@ -432,7 +432,7 @@ def test_frames_that_a_busy_machine_skipped_are_not_blamed_on_the_images():
         "frames": {"sent": 34, "tracked": 5},
         "drops": {"superseded": 23, "too_old": 6, "duplicate": 9},
     }
-    told = "the server had no time for 29 of 34; a smaller --resize or --rate-hz"
+    told = "the server had no time for 29 of 34; a smaller --resize, a larger --stride"
     assert f"only 6% of the frames have a pose: {told}" in few_poses({"completeness": 0.059, **skipped})
     assert f"no frame has a pose: {told}" in why_no_pose({"completeness": 0.0, **skipped})
     few = {**skipped, "drops": {"superseded": 10}}

@@ -239,7 +239,7 @@ def test_a_server_without_time_for_most_frames_says_so_once_and_what_leaves_it_m
     told = [text for text in caplog.messages if text.startswith("the server had no time")]
     assert len(told) == (num_superseded > 2)
     if told:
-        assert "had no time for 3 of 4; a smaller --resize or --rate-hz" in told[0]
+        assert "had no time for 3 of 4; a smaller --resize, a larger --stride" in told[0]
 
 
 @pytest.mark.parametrize(("interval_s", "saved"), [(3600.0, 0), (0.1, 1)])
