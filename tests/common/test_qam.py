@@ -50,6 +50,15 @@ def test_hand_computed_point():
     assert point == pytest.approx((3 - 1j) / math.sqrt(10), abs=1e-6)
 
 
+def test_a_payload_is_read_as_the_page_on_file_formats_says():
+    level = {0b00: -3, 0b01: -1, 0b11: 1, 0b10: 3}
+    payload = bytes([0x0D, 0x72])
+    halves = [half for byte in payload for half in (byte >> 4, byte & 15)]
+    expected = [(level[k >> 2] + 1j * level[k & 3]) / np.sqrt(10) for k in halves]
+    got = qam.indices_to_symbols(qam.unpack_indices(payload, 4))
+    np.testing.assert_allclose(got, expected, rtol=1e-6)
+
+
 @given(st.lists(st.integers(0, 15), min_size=0, max_size=65))
 def test_packing_round_trips(values):
     indices = np.array(values, dtype=np.uint8)
