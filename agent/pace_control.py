@@ -17,6 +17,8 @@ logger = logging.getLogger(__name__)
 
 #: Frames a second that two cores can decode, track and map, about: a stream begins with so many.
 START_HZ = 12.0
+#: By then it is seen how many a camera gives: in the dark fewer than it says, over a network any number.
+_START_S = 1.0
 #: A camera of 30 Hz before a server that takes a second a frame.
 MAX_STRIDE = 30
 #: Reports a decision is made from, at least,
@@ -65,6 +67,8 @@ class PaceControl:
         self._quiet = 0
         self._num_reports = self._since_change = 0
         self._num_captured = 0
+        self._begun_ns: int | None = None
+        self._is_start = self._stride > 1
         self._captured_at_sent: deque[int] = deque(maxlen=_MAX_REPORTS)
         self._first_ns: int | None = None  # capture of the first frame that is reported on and counts,
         self._first_kept_ns = 0  # and of the first one whose report is among those kept
@@ -84,6 +88,7 @@ class PaceControl:
             t_capture_ns: When it was captured, on the clock of the reports.
         """
         with self._lock:
+            self._check_start(t_capture_ns)
             self._num_captured += 1
             self._not_sent += 1
             if self._not_sent < self._stride:
@@ -92,6 +97,17 @@ class PaceControl:
             if self._valid_from_ns is None:
                 self._valid_from_ns = t_capture_ns
             return True
+
+    def _check_start(self, t_capture_ns: int) -> None:
+        """Send more from the first second on where the source gives fewer frames than it said."""
+        if self._begun_ns is None:
+            self._begun_ns = t_capture_ns
+        elapsed_s = (t_capture_ns - self._begun_ns) * 1e-9
+        if not self._is_start or elapsed_s < _START_S:
+            return
+        self._is_start = False
+        self._stride = min(self._stride, start_stride(self._num_captured / elapsed_s))
+        self._captured_at_sent.clear()
 
     def on_sent(self) -> None:
         """Note that a frame was sent: an agent that encodes slowly sends fewer than are wanted."""
@@ -145,7 +161,7 @@ class PaceControl:
         return max(self._stride, statistics.median_low(steps)) if steps else self._stride
 
     def _change(self, stride: int, *, is_trial: bool) -> None:
-        self._stride, self._is_trial = stride, is_trial
+        self._stride, self._is_trial, self._is_start = stride, is_trial, False
         self._valid_from_ns = None
         self._passed_over.clear()
         self._captured_at_sent.clear()

@@ -180,6 +180,16 @@ def test_a_fast_source_begins_with_what_two_cores_can_serve_and_goes_up():
     assert server.superseded == 0
 
 
+@pytest.mark.parametrize(("given_hz", "stride"), [(10.0, 1), (20.0, 2), (30.0, 3), (60.0, 3)])
+def test_a_camera_that_gives_fewer_images_than_it_says_is_thinned_by_what_it_gives(given_hz, stride):
+    pace = PaceControl(1, 30.0)
+    for k in range(round(1.2 * given_hz)):
+        pace.wants(round(k / given_hz * 1e9))
+        if k < 0.9 * given_hz:
+            assert pace.stride == 3
+    assert pace.stride == stride
+
+
 class Reports:
     """Reports on every frame of a source, each with so many passed over since the one before."""
 
