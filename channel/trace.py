@@ -111,13 +111,14 @@ def _numbers(row: dict[str, str], names: tuple[str, ...], where: str) -> list[fl
         raise ConfigError(f"{where}: {' and '.join(names)} must be numbers, got {got}") from err
 
 
-def read_trace_csv(path: Path) -> FileTrace:
+def read_trace_csv(path: Path | str) -> FileTrace:
     """Read a trace with the columns ``t_s,snr_db`` and perhaps ``slot_loss``, named in a header line.
 
     Raises:
         ConfigError: The file can't be read, a column is missing, a value is no number or out of range, times
             don't increase or there is no row. The message names the line.
     """
+    path = Path(path)
     times_s: list[float] = []
     values_db: list[float] = []
     losses: list[float] = []

@@ -66,7 +66,7 @@ def test_a_file_on_any_clock_begins_with_the_first_frame_and_may_tell_losses(tmp
     assert [trace.snr_db(t) for t in (0, 1, 2, 9)] == [10, 7, 4, 4]
     assert [trace.slot_loss(t) for t in (0, 1, 2, 9)] == [0, 0.25, 0.5, 1]
     path.write_text("t_s,snr_db\n0,10\n")
-    assert read_trace_csv(path).slot_loss(5.0) == 0
+    assert read_trace_csv(str(path)).slot_loss(5.0) == 0
 
 
 @pytest.mark.parametrize(
