@@ -172,6 +172,9 @@ class _Sending:
         if self._pace is not None:
             self._pace.on_sent()
         self.metrics.count("sent")
+        if self._settings.rate == "auto":
+            uses = message.num_slots * message.uses_per_slot
+            self.metrics.be_at(f"sending {uses} channel uses a frame")
         self.metrics.observe("capture_to_sent", (time.monotonic_ns() - message.t_capture_ns) * 1e-6)
         self._say_if_slow()
 

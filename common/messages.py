@@ -437,7 +437,8 @@ class StatusMessage(_Versioned):
         drops: Frames dropped since the start, by reason.
         stages_ms: Stage to (p50, p95, max) over the last frames.
         last_error: One line, empty when there was none.
-        activity: What it is at besides frames, in a few words; empty when it is at nothing else.
+        activity: What it is at besides frames, in a few words; empty when it is at nothing else. Of an agent
+            whose rate follows the link: how many channel uses a frame takes now.
         ended: Of an agent: its source came to its end, and ``counts["sent"]`` frames are all there are.
     """
 

@@ -57,9 +57,14 @@ def test_a_report_of_a_frame_that_was_never_sent_is_not_believed(bench, caplog):
 @pytest.mark.parametrize(("rate", "coded_hw"), [("1/48", (32, 32)), ("auto", (64, 96))])
 def test_frames_travel_at_the_rate_and_feedback_chooses_it(bench, rate, coded_hw):
     bench.channel(snr_db=-3.0)
+    told = []
+    key = status_key("agent0", "agent")
+    bench.hub.subscribe(key, "every", lambda payload: told.append(unpack(payload, StatusMessage).activity))
     receiver, agent = bench.receiver(), bench.agent(rate=rate, source={"repeat": "loop"})
     frames = take(receiver, count=20)
+    until(lambda: told and (rate != "auto" or "1152" in told[-1]), "the status")
     agent.end()
+    assert told[-1] == ("sending 1152 channel uses a frame" if rate == "auto" else "")
     assert frames[-1].message.image_hw == coded_hw
     assert frames[-1].camera.image_wh == (64, 48)
     assert frames[-1].received.shape_hw == coded_hw
