@@ -49,6 +49,7 @@ The map
     keyframe_rule     when a frame becomes a keyframe
     new_landmarks     tracks of keyframes, triangulated
     observations      what keyframes saw of some tracks
+    drift             how far keyframes may be off against the start, which adds up on the way
     pose_covariance   how well a pose is known, against the newest keyframes and with these in the world
     scene_depth       how far away the scene is
     thinning          what goes when the map reaches its limits
@@ -62,6 +63,7 @@ Bundle adjustment
     bundle_problem    the problem and its result, as plain arrays
     bundle            solves a problem: dense for small ones, GTSAM for the rest
     dense_bundle      Levenberg-Marquardt with the Schur complement in numpy
+    window_covariance how well its keyframes are known, with errors that neighbours share (jackknife)
     bundle_process    the same in a process of its own
     adjustment        brings the result into the map, and lets what it had no room for follow
     whole_map         the adjustment of all keyframes at the end of a stream

@@ -16,15 +16,16 @@ from semcast.server.geometry.edges import rounded, whiteners
 from semcast.server.geometry.projection import project_in_front
 from semcast.server.geometry.weighting import HUBER_K
 from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult
-from semcast.server.mapping.dense_bundle import Baseline, State, Window, last_covariance, minimise
+from semcast.server.mapping.dense_bundle import Baseline, State, Window, minimise
 from semcast.server.mapping.pose_graph import FIXED_SIGMA, PoseConstraint
 from semcast.server.mapping.residual_patterns import pattern_products_of
+from semcast.server.mapping.window_covariance import window_covariance
 from semcast.server.worker import Inline
 
 Array = NDArray[np.float64]
 
-#: Poses, points and the covariance of the last pose, or None.
-_Solved = tuple[Array, Array, Array | None]
+#: Poses and points.
+_Solved = tuple[Array, Array]
 
 #: Observations share noise models: their sigmas are rounded to this many steps.
 NUM_SIGMAS = 16
@@ -156,14 +157,18 @@ def optimise(problem: BundleProblem) -> BundleResult:
         is_dense = problem.solver == "dense" and is_small
         solved = (_by_dense_algebra if is_dense else _by_gtsam)(problem, used)
     ok = solved is not None
-    T_world_cam, xyz, covariance = solved or (problem.T_world_cam.copy(), problem.xyz.copy(), None)
+    T_world_cam, xyz = solved or (problem.T_world_cam.copy(), problem.xyz.copy())
     residual, _ = residuals_px(problem, T_world_cam, xyz)
     residual[~used] = np.nan
+    covariances = None
+    if ok and problem.with_covariance:
+        window, _, points = _window_of(problem, used)
+        covariances = window_covariance(window, State(T_world_cam, xyz[points]))
     pattern_products = None
     if ok and problem.motion is not None:
         pattern_products = pattern_products_of(problem, problem.motion, T_world_cam, xyz, residual)
     elapsed_ms = (time.perf_counter_ns() - started) * 1e-6
-    return BundleResult(problem, ok, T_world_cam, xyz, residual, covariance, elapsed_ms, pattern_products)
+    return BundleResult(problem, ok, T_world_cam, xyz, residual, covariances, elapsed_ms, pattern_products)
 
 
 def _window_of(problem: BundleProblem, used: NDArray[np.bool_]) -> tuple[Window, State, NDArray[np.intp]]:
@@ -193,7 +198,7 @@ def _by_dense_algebra(problem: BundleProblem, used: NDArray[np.bool_]) -> _Solve
     xyz[points] = solved.xyz
     if not (np.isfinite(T_world_cam).all() and np.isfinite(xyz).all()):
         return None
-    return T_world_cam, xyz, last_covariance(window, solved) if problem.with_covariance else None
+    return T_world_cam, xyz
 
 
 def _by_gtsam(problem: BundleProblem, used: NDArray[np.bool_]) -> _Solved | None:
@@ -217,17 +222,7 @@ def _by_gtsam(problem: BundleProblem, used: NDArray[np.bool_]) -> _Solved | None
     xyz[points] = np.array([solved.atPoint3(L(p)) for p in points.tolist()])
     if not (np.isfinite(T_world_cam).all() and np.isfinite(xyz).all()):
         return None
-    covariance = _covariance(graph, solved, len(T_world_cam) - 1) if problem.with_covariance else None
-    return T_world_cam, xyz, covariance
-
-
-def _covariance(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, k: int) -> Array | None:
-    """Marginal covariance of one pose, None where the system does not fix it."""
-    try:
-        covariance = np.asarray(gtsam.Marginals(graph, values).marginalCovariance(X(k)))
-    except (RuntimeError, IndexError):  # IndexError: no observation is left on this pose
-        return None
-    return covariance if np.isfinite(covariance).all() else None
+    return T_world_cam, xyz
 
 
 class InlineBundle(Inline[BundleProblem, BundleResult]):

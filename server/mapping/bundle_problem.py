@@ -61,7 +61,7 @@ class BundleProblem:
         iterations: Levenberg-Marquardt steps at most.
         num_anchors: So many of the first keyframes are of long ago; they are held, and only what the others
             see is adjusted.
-        with_covariance: Whether the covariance of the last pose is wanted.
+        with_covariance: Whether it is wanted how well the poses are known.
         huber_px: See ``NoiseModel``.
         edge: ``(M, 2)`` of each observation, see ``edges``.
         motion: Of the views, where it is wanted what the residuals say about shutter and lens.
@@ -160,8 +160,8 @@ class BundleResult:
         T_world_cam: ``(K, 4, 4)``.
         xyz: ``(P, 3)``.
         residual_px: ``(M, 2)`` observed minus projected, NaN behind the camera or not used.
-        covariance: ``(6, 6)`` marginal covariance of the last keyframe's pose in its own frame, rotation
-            before translation, or None.
+        covariances: ``(K, 7, 7)``, how well each keyframe is known against those that are fixed, see
+            ``window_covariance``; None where it was not asked for, or nothing fixes the window.
         elapsed_ms: Time it took.
         pattern_products: ``(K, 9, 9)``, see ``residual_patterns``; None where ``motion`` was not given.
     """
@@ -171,7 +171,7 @@ class BundleResult:
     T_world_cam: Array
     xyz: Array
     residual_px: Array
-    covariance: Array | None
+    covariances: Array | None
     elapsed_ms: float
     pattern_products: Array | None = None
 

@@ -215,29 +215,51 @@ def _inverse_of_lower(lower: Array) -> Array:
     return inverse
 
 
-def linearise(window: Window, seen: Seen) -> Normal:
-    """Return the normal equations around a state, each observation weighted by Huber's loss."""
+@dataclass(frozen=True)
+class Slopes:
+    """What each observation says of poses and points around a state, in standard deviations.
+
+    Weighted by Huber's loss: products of slopes are information.
+
+    Attributes:
+        by_xyz: ``(2, 3, M)`` by the point, world frame.
+        by_pose: ``(2, 6, F)`` by a twist of the camera in its own frame, of ``Window.of_free``.
+        residual: ``(2, M)`` observed minus projected.
+    """
+
+    by_xyz: Array
+    by_pose: Array
+    residual: Array
+
+
+def slopes_at(window: Window, seen: Seen) -> Slopes:
+    """Return the slopes around a state."""
     x, y, z = seen.points_cam
     front = z > 0.0
     z = np.where(front, z, 1.0)
     weight = np.sqrt(np.minimum(1.0, window.limit / np.maximum(seen.length, 1e-12)))
     weight = np.where(front, weight, 0.0)
-    residual = weight * seen.residual
     by_x, by_y = (weight * window.whitener * (f / z) for f in (window.camera.fx, window.camera.fy))
     by_x, by_y = by_x[:, 0], by_y[:, 1]
     by_point = np.stack([by_x, by_y, -(by_x * x + by_y * y) / z], axis=1)
     by_xyz = np.einsum("aim,ijm->ajm", by_point, seen.R_cam_world)
+    # Not by an index in brackets, here and below: that puts observations first in memory, and products then
+    # take thrice as long.
+    of_free = (values.take(window.of_free, axis=-1) for values in (by_point, seen.points_cam))
+    return Slopes(by_xyz, _by_pose(*of_free), weight * seen.residual)
+
+
+def linearise(window: Window, state: State, slopes: Slopes) -> Normal:
+    """Return the normal equations around a state."""
+    by_xyz, residual = slopes.by_xyz, slopes.residual
     own = _products(by_xyz, np.concatenate([by_xyz, residual[:, None]], axis=1))
-    sums = [_summed(window.point, row, window.num_points) for row in own.reshape(12, -1)]
+    sums = [summed(window.point, row, window.num_points) for row in own.reshape(12, -1)]
     points = np.stack(sums, axis=1).reshape(window.num_points, 3, 4)
     rows, count = window.of_free, window.num_unknowns
-    # Not by an index in brackets: that puts observations first in memory, and the products below take thrice
-    # as long.
-    by_point, by_xyz, residual = (values.take(rows, axis=-1) for values in (by_point, by_xyz, residual))
-    by_pose = _by_pose(by_point, seen.points_cam.take(rows, axis=-1))
-    poses, right_poses = _poses_own(window, by_pose, residual)
-    _hold_baseline(window, seen.state, poses, right_poses)
-    both = _summed(window.place, _products(by_xyz, by_pose).ravel(), 3 * window.num_points * count)
+    by_xyz, residual = (values.take(rows, axis=-1) for values in (by_xyz, residual))
+    poses, right_poses = _poses_own(window, slopes.by_pose, residual)
+    _hold_baseline(window, state, poses, right_poses)
+    both = summed(window.place, _products(by_xyz, slopes.by_pose).ravel(), 3 * window.num_points * count)
     both = both.reshape(window.num_points, 3, count)
     return Normal(poses, points[..., :3], both, right_poses, points[..., 3])
 
@@ -250,7 +272,7 @@ def _by_pose(by_point: Array, points_cam: Array) -> Array:
     return np.stack([*turn, -by_x, -by_y, -by_z], axis=1)
 
 
-def _summed(group: NDArray[np.intp], values: Array, num_groups: int) -> Array:
+def summed(group: NDArray[np.intp], values: Array, num_groups: int) -> Array:
     """Sums of values ``(N,)`` over groups."""
     return np.asarray(np.bincount(group, values, num_groups), dtype=np.float64)
 
@@ -309,7 +331,7 @@ def minimise(window: Window, state: State, iterations: int) -> State:
 
 def _better(window: Window, seen: Seen, damping: float) -> tuple[Seen | None, float]:
     """Find a damping with which a step is worth it: where that leads to, or None, and the next damping."""
-    normal = linearise(window, seen)
+    normal = linearise(window, seen.state, slopes_at(window, seen))
     while damping < _MAX_DAMPING:
         try:
             twists, moves, promised = normal.step(damping)
@@ -324,16 +346,3 @@ def _better(window: Window, seen: Seen, damping: float) -> tuple[Seen | None, fl
                 break
         damping *= _DAMPING_FACTOR
     return None, damping
-
-
-def last_covariance(window: Window, state: State) -> Array | None:
-    """Marginal covariance ``(6, 6)`` of the last pose, None where it is held or nothing fixes it."""
-    if not window.free[-1]:
-        return None
-    try:
-        system = linearise(window, see(window, state)).reduced(0.0)[0]
-        np.linalg.cholesky(system)
-        covariance = np.asarray(np.linalg.inv(system)[-6:, -6:], np.float64)
-    except np.linalg.LinAlgError:
-        return None
-    return covariance if np.isfinite(covariance).all() else None

@@ -36,8 +36,10 @@ _SHAPES = {
 }
 #: Submaps whose place was guessed, and what the guesses are worth: all of these or none.
 _GUESSES = {"guesses": "S 2", "guesses.is_known": "S", "guesses.covariance": "S 7 7"}
+#: Of which keyframes it is known how far they may be off, and how far: both or none.
+_DRIFT = {"drift.frame_id": "C", "drift.covariance": "C 7 7"}
 #: Arrays that older checkpoints lack; so they do ``readout``.
-_ADDED = {"revisits": "R 2", "gaps": "G", "keyframes.edge": "O 2", **_GUESSES}
+_ADDED = {"revisits": "R 2", "gaps": "G", "keyframes.edge": "O 2", **_GUESSES, **_DRIFT}
 #: Keyframes and frames refer to poses by frame id.
 _OF_POSES = {"keyframes.frame_id": "keyframes", "frames.keyframe_id": "frames"}
 
@@ -55,8 +57,9 @@ def check_map_arrays(arrays: Mapping[str, NDArray], parts: tuple[str, ...]) -> N
     """
     sizes: dict[str, int] = {}
     added = {name: shape for name, shape in _ADDED.items() if name in arrays}
-    if "guesses" in arrays:
-        added |= _GUESSES
+    for first, group in (("guesses", _GUESSES), ("drift.frame_id", _DRIFT)):
+        if first in arrays:
+            added |= group
     for name, shape in {**_SHAPES, **added}.items():
         for word, size in check_shape(arrays[name], shape, name).items():
             if sizes.setdefault(word, size) != size:
@@ -73,6 +76,8 @@ def check_map_arrays(arrays: Mapping[str, NDArray], parts: tuple[str, ...]) -> N
     refer = [(arrays[name], what) for name, what in _OF_POSES.items()]
     if "guesses" in arrays:
         refer.append((arrays["guesses"][:, 1], "guesses"))
+    if "drift.frame_id" in arrays:
+        refer.append((arrays["drift.frame_id"], "drift"))
     for frame_ids, what in refer:
         unknown = np.setdiff1d(frame_ids, arrays["poses.frame_id"])
         if len(unknown):

@@ -95,7 +95,6 @@ class MapBuilder:
         self.noise = OnlineNoise(s.confidence, s.sigma0_px, s.beta, s.fit_noise)
         self.relocaliser = Relocaliser(self._camera, s.seed, s.max_features)
         self._wide = WideRecogniser(self._camera, s.seed)
-        self._adjusted: tuple[int, Array] | None = None
         self.enter(0)
         self.num_inliers_at_keyframe = 0
         self.images = KeyframeImages(_MAX_IMAGES)
@@ -123,7 +122,6 @@ class MapBuilder:
 
     def enter(self, submap: int) -> None:
         """Make a submap the current one."""
-        self._adjusted = None  # of a keyframe elsewhere, or in another unit
         self._recognised: int | None = None
         self.loops = LoopFinder(self._camera, self.relocaliser, self._settings.seed)
         self.submap = submap
@@ -272,7 +270,7 @@ class MapBuilder:
         self._abandon_adjustment()
         self.world.bend(keyframe_ids, solved.T_world_cam, solved.scale)
         self.world.revisits[loop.keyframe_id] = loop.place.keyframe_id
-        self._adjusted = None
+        self.world.drift.close(loop.place.keyframe_id, loop.keyframe_id, self.world.poses)
         self._on_moved(float(solved.scale[-1]))
         logger.info("keyframe %d: a loop is closed, to keyframe %d", loop.keyframe_id, loop.place.keyframe_id)
         return True
@@ -397,8 +395,7 @@ class MapBuilder:
             return None
         apply_result(self.world, result, self.noise)
         place_left_out(self.world, self._camera, self.noise.model, result)
-        if result.covariance is not None:
-            self._adjusted = (int(result.problem.keyframe_ids[-1]), result.covariance)
+        self.world.drift.take(result)
         self.watch.take(result)
         return result
 
@@ -421,7 +418,6 @@ class MapBuilder:
             return 0
         num_adjusted = adjust_whole_map(self.world, self._camera, self.noise.model)
         if num_adjusted:
-            self._adjusted = None
             self._on_moved(1.0)
         return num_adjusted
 
@@ -435,7 +431,6 @@ class MapBuilder:
         self._abandon_adjustment()
         self.world.transform_submap(submap, submap, scale, T_new_old)
         self.world.guesses[submap] = guess
-        self._adjusted = None
         self._on_moved(scale)
         return scale
 
@@ -472,7 +467,10 @@ class MapBuilder:
             return None
         self._abandon_adjustment()
         moving, staying = (self.submap, place.submap) if is_newer else (place.submap, self.submap)
+        moved_ids = [k for k, part in self.world.submap_of.items() if part == moving]
+        leader_id = place.keyframe_id if is_newer else self.world.keyframes_of(staying)[-1].frame_id
         self.world.transform_submap(moving, staying, *join)
+        self.world.drift.follow(moved_ids, leader_id, self.world.poses)
         scale = scale if is_newer else 1.0
         self.enter(min(self.submap, place.submap))
         self.world.revisits[self.world.keyframes[-1].frame_id] = place.keyframe_id
@@ -490,4 +488,4 @@ class MapBuilder:
 
     def pose_covariance(self, covariance_in_map: Array | None, T_world_cam: Array) -> Array | None:
         """Covariance of a frame in the current submap, ``(6, 6)`` or None: see ``pose_covariance``."""
-        return pose_covariance(self.world, self.submap, self._adjusted, covariance_in_map, T_world_cam)
+        return pose_covariance(self.world, self.submap, covariance_in_map, T_world_cam)

@@ -1,4 +1,4 @@
-"""How well a pose is known: against the newest keyframes, and with them against the rest of the map."""
+"""How well a pose is known: against the newest keyframes, and with them against the start of the map."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,18 +11,13 @@ Array = NDArray[np.float64]
 
 
 def pose_covariance(
-    world: WorldMap,
-    submap: int,
-    adjusted: tuple[int, Array] | None,
-    covariance_in_map: Array | None,
-    T_world_cam: Array,
+    world: WorldMap, submap: int, covariance_in_map: Array | None, T_world_cam: Array
 ) -> Array | None:
-    """Covariance of a frame: that of the last adjusted keyframe carried over, its own, and a guess's.
+    """Covariance of a frame: its own, the drift of the newest adjusted keyframe carried over, and a guess's.
 
     Args:
         world: The map.
         submap: Part of it the frame is in.
-        adjusted: A keyframe's frame id and the covariance ``(6, 6)`` of its pose; None without.
         covariance_in_map: ``(6, 6)`` of the frame relative to the map, in the camera frame.
         T_world_cam: Its pose.
 
@@ -33,10 +28,11 @@ def pose_covariance(
     if covariance_in_map is None:
         return None
     found = covariance_in_map
-    if adjusted is not None and world.submap_of[adjusted[0]] == submap:
-        keyframe_id, covariance = adjusted
-        carried = similarity_adjoint(invert_transform(world.poses[keyframe_id]) @ T_world_cam)[:6, :6]
-        found = found + carried @ covariance @ carried.T
+    for keyframe in reversed(world.keyframes):
+        if keyframe.submap == submap and (drift := world.drift.of(keyframe.frame_id)) is not None:
+            carried = similarity_adjoint(invert_transform(keyframe.T_world_cam) @ T_world_cam)
+            found = found + (carried @ drift @ carried.T)[:6, :6]
+            break
     if (guess := world.guesses.get(submap)) is None:
         return found
     guessed = guess.seen_from(invert_transform(world.poses[guess.frame_id]) @ T_world_cam)

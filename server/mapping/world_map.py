@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from semcast.common.geometry import invert_transform, transform_points
 from semcast.server.geometry.edges import alike, each_of
+from semcast.server.mapping.drift import Drift
 from semcast.server.mapping.guessed_place import GuessedPlace, guesses_as_arrays, guesses_of
 from semcast.server.mapping.landmarks import Landmarks
 from semcast.server.mapping.map_arrays import check_map_arrays
@@ -96,6 +97,7 @@ class WorldMap:
         revisits: Frame id of a keyframe -> that of an older one whose landmarks it saw again.
         gaps: Frame ids of keyframes behind a gap in the tracks, noted when keyframes are thinned out.
         guesses: Submap whose place in the world was guessed -> what that is worth, until it is moved.
+        drift: How far keyframes may be off against the start of their part.
     """
 
     def __init__(self) -> None:
@@ -110,6 +112,7 @@ class WorldMap:
         self.revisits: dict[int, int] = {}
         self.gaps: set[int] = set()
         self.guesses: dict[int, GuessedPlace] = {}
+        self.drift = Drift()
         self._changed: set[int] = set()
         self._moved_keyframes: set[int] = set()
         self._frames_moved: set[int] = set()
@@ -224,7 +227,7 @@ class WorldMap:
         self._moved_keyframes.update(moved)
         for keyframe in self.keyframes_of(submap):
             keyframe.T_world_cam, keyframe.submap = self.poses[keyframe.frame_id], into
-        self.rescale_frames(dict.fromkeys(moved, scale))
+        self._rescale(dict.fromkeys(moved, scale))
         self._frames_moved.update(self.frames)
 
     def bend(self, keyframe_ids: Ids, T_world_cam: Array, scale: Array) -> None:
@@ -254,8 +257,13 @@ class WorldMap:
         self._moved_keyframes.update(frame_ids.tolist())
         for keyframe in self.keyframes:
             keyframe.T_world_cam = self.poses[keyframe.frame_id]
-        self.rescale_frames(dict(zip(frame_ids.tolist(), scale[at].tolist(), strict=True)))
+        self._rescale(dict(zip(frame_ids.tolist(), scale[at].tolist(), strict=True)))
         self._frames_moved.update(self.frames)
+
+    def _rescale(self, factor: dict[int, float]) -> None:
+        """Take over another unit of length in what is told relative to keyframes."""
+        self.rescale_frames(factor)
+        self.drift.rescale(factor)
 
     def rescale_frames(self, factor: dict[int, float]) -> None:
         """Scale the poses of frames relative to keyframes."""
@@ -288,6 +296,7 @@ class WorldMap:
         kept = evenly_thinned(np.array([k.frame_id for k in old]), len(old) // 2)
         self.keyframes = [old[row] for row in kept.tolist()] + young
         self.revisits = hung_on_what_is_left(self.revisits, self.keyframes, self.submap_of)
+        self.drift.keep({k.frame_id for k in self.keyframes})
         return True
 
     def pose_of_frame(self, frame_id: int) -> Array | None:
@@ -367,6 +376,7 @@ class WorldMap:
             "revisits": np.array(list(self.revisits.items()), dtype=np.int64).reshape(-1, 2),
             "gaps": np.array(sorted(self.gaps), dtype=np.int64),
             **guesses_as_arrays(self.guesses),
+            **self.drift.arrays(),
         }
 
     def restore(self, arrays: dict[str, NDArray]) -> None:
@@ -413,6 +423,7 @@ class WorldMap:
         self.revisits = {new: old for new, old in revisits.tolist() if {new, old} <= there}
         self.gaps = set(arrays.get("gaps", np.zeros(0, np.int64)).tolist())
         self.guesses = guesses_of(arrays)
+        self.drift.restore(arrays)
         self._changed = set(self.landmarks.ids.tolist())
         self._moved_keyframes = set(self.poses)
 

@@ -3,14 +3,17 @@ import signal
 from dataclasses import replace
 from itertools import pairwise
 
+import gtsam
 import numpy as np
 import pytest
+from gtsam.symbol_shorthand import X
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_se3, exp_so3, invert_transform, make_transform, transform_points
 from semcast.server.geometry.edges import alike, rounded
 from semcast.server.geometry.projection import project_with_jacobian
 from semcast.server.mapping import bundle, dense_bundle
+from semcast.server.mapping import window_covariance as covariance_of_window
 from semcast.server.mapping.bundle import InlineBundle, optimise, quantised_sigma, residuals_px
 from semcast.server.mapping.bundle_problem import BundleProblem
 from semcast.server.mapping.bundle_process import ProcessBundle
@@ -140,11 +143,11 @@ def test_residuals_show_the_outlier():
 def test_covariance_is_the_inverse_of_the_information_where_points_are_free_and_two_poses_are_not():
     sigma = float(quantised_sigma(np.ones(1))[0][8])
     problem, T_world_cam, xyz = make_problem(
-        num_views=4, num_points=20, noise_px=0.0, shake=0.0, iterations=1
+        num_views=4, num_points=12, noise_px=0.0, shake=0.0, iterations=1
     )
     result = optimise(BundleProblem(**{**vars(problem), "sigma_px": np.full(len(problem.xy), sigma)}))
     # Unknowns: poses 2 and 3, each moved in its own frame, and the points.
-    jacobian = np.zeros((len(problem.xy), 2, 12 + 3 * 20))
+    jacobian = np.zeros((len(problem.xy), 2, 12 + 3 * 12))
     for row, (k, p) in enumerate(zip(problem.view, problem.point, strict=True)):
         T_cam_world = invert_transform(T_world_cam[k])
         xyz_cam, axes = transform_points(T_cam_world, xyz[p][None]).T, np.diag([CAMERA.fx, CAMERA.fy])
@@ -155,18 +158,18 @@ def test_covariance_is_the_inverse_of_the_information_where_points_are_free_and_
     rows = jacobian.reshape(-1, jacobian.shape[-1]) / sigma
     expected = np.linalg.inv(rows.T @ rows)[6:12, 6:12]
     scale = np.sqrt(np.diag(expected))
-    assert np.allclose(
-        result.covariance / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-3
-    )
+    found = result.covariances[-1, :6, :6]
+    assert np.allclose(found / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-3)
 
 
-def test_covariance_is_that_of_the_last_pose():
-    tight, loose = (optimise(make_problem(noise_px=s)[0]) for s in (0.2, 0.8))
-    assert tight.covariance is not None
-    assert loose.covariance is not None
-    assert tight.covariance.shape == (6, 6)
-    ratio = np.sqrt(np.diag(loose.covariance) / np.diag(tight.covariance))
+@pytest.mark.parametrize("solver", ["dense", "gtsam"])
+def test_covariances_are_those_of_the_poses(solver):
+    tight, loose = (optimise(make_problem(noise_px=s, solver=solver)[0]) for s in (0.2, 0.8))
+    assert tight.covariances.shape == (6, 7, 7)
+    assert not tight.covariances[:2].any(), "of those that are held"
+    ratio = np.sqrt(np.diagonal(loose.covariances[2:], 0, 1, 2) / np.diagonal(tight.covariances[2:], 0, 1, 2))
     assert np.allclose(ratio, 4.0, rtol=0.1)
+    assert optimise(make_problem(with_covariance=False, solver=solver)[0]).covariances is None
 
 
 def test_a_point_behind_a_camera_is_left_out():
@@ -276,7 +279,9 @@ def with_outliers(problem):
         "seen twice",
     ],
 )
-def test_dense_algebra_ends_where_gtsam_does(changes):
+def test_dense_algebra_ends_where_gtsam_does(changes, monkeypatch):
+    # The information alone, as GTSAM's marginals.
+    monkeypatch.setattr(covariance_of_window, "_MIN_GROUPS", 99)
     problem, _, _ = make_problem(num_points=40, shake=0.05)
     dense, sparse = both_ways(BundleProblem(**{**vars(problem), **changes(problem)}))
     assert dense.ok
@@ -284,9 +289,13 @@ def test_dense_algebra_ends_where_gtsam_does(changes):
     assert np.abs(sparse.T_world_cam - problem.T_world_cam).max() > 0.01
     np.testing.assert_allclose(dense.T_world_cam, sparse.T_world_cam, atol=2e-6)
     np.testing.assert_allclose(dense.xyz, sparse.xyz, atol=2e-5)
-    scale = np.sqrt(np.diag(sparse.covariance))
-    difference = (dense.covariance - sparse.covariance) / np.outer(scale, scale)
-    assert np.abs(difference).max() < 1e-3
+    ended = replace(sparse.problem, T_world_cam=sparse.T_world_cam, xyz=sparse.xyz)
+    marginals = gtsam.Marginals(*bundle._build(ended, np.ones(len(ended.xy), bool)))
+    for k in np.flatnonzero(~ended.fixed).tolist():
+        expected = marginals.marginalCovariance(X(k))
+        scale = np.sqrt(np.diag(expected))
+        difference = (dense.covariances[k, :6, :6] - expected) / np.outer(scale, scale)
+        assert np.abs(difference).max() < 1e-3
 
 
 def test_a_step_that_would_make_it_worse_is_shortened_as_gtsam_does(monkeypatch):
@@ -310,7 +319,7 @@ def test_a_last_pose_that_is_held_or_unseen_has_no_covariance(fixed_last):
     fixed = problem.fixed | (fixed_last & (np.arange(6) == 5))
     result = optimise(BundleProblem(**{**vars(problem), **kept, "fixed": fixed}))
     assert result.ok
-    assert result.covariance is None
+    assert result.covariances is None
     np.testing.assert_allclose(result.T_world_cam[5], problem.T_world_cam[5], atol=1e-12)
     assert np.linalg.norm(result.T_world_cam[2:5, :3, 3] - T_world_cam[2:5, :3, 3], axis=1).max() < 0.05
 
@@ -322,7 +331,7 @@ def test_a_last_pose_that_saw_a_single_point_has_no_covariance():
     kept = {name: vars(problem)[name][seen] for name in names}
     result = optimise(BundleProblem(**{**vars(problem), **kept}))
     assert result.ok
-    assert result.covariance is None
+    assert result.covariances is None
 
 
 @pytest.mark.parametrize(("solver", "other"), [("dense", "_by_gtsam"), ("gtsam", "_by_dense_algebra")])
@@ -331,8 +340,8 @@ def test_the_solver_is_the_one_that_is_set_and_gives_a_covariance_where_it_is_wa
 ):
     monkeypatch.setattr(bundle, other, None)
     problem, _, _ = make_problem(solver=solver)
-    assert optimise(problem).covariance is not None
-    assert optimise(replace(problem, with_covariance=False)).covariance is None
+    assert optimise(problem).covariances is not None
+    assert optimise(replace(problem, with_covariance=False)).covariances is None
 
 
 def test_points_are_adjusted_where_all_poses_are_held():

@@ -31,6 +31,7 @@ def make_world():
     add_world(world, [1, 2, 3], 0, 10)
     add_world(world, [5, 6], 1, 30)
     world.guesses = {1: GuessedPlace(20, np.diag(np.arange(1.0, 8.0))), 0: GuessedPlace(10, None)}
+    world.drift.restore({"drift.frame_id": np.array([10, 30]), "drift.covariance": np.stack([np.eye(7)] * 2)})
     return world
 
 

@@ -1,0 +1,141 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import exp_se3, exp_so3, invert_transform, make_transform, transform_points
+from semcast.server.mapping import window_covariance as covariance_of_window
+from semcast.server.mapping.dense_bundle import State, Window, linearise, minimise, see, slopes_at
+from semcast.server.mapping.window_covariance import groups_by_place, window_covariance
+
+CAMERA = Intrinsics(fx=500.0, fy=480.0, cx=320.0, cy=240.0, width=640, height=480)
+NUM_VIEWS, NUM_POINTS = 6, 160
+VIEW, POINT = (a.ravel() for a in np.meshgrid(np.arange(NUM_VIEWS), np.arange(NUM_POINTS), indexing="ij"))
+
+
+def scene():
+    """Poses and points that are the truth in all tests."""
+    rng = np.random.default_rng(5)
+    T_world_cam = np.stack(
+        [
+            make_transform(exp_so3(rng.normal(0, 0.05, 3)), (0.4 * k, 0.1 * rng.normal(), 0.1 * k))
+            for k in range(NUM_VIEWS)
+        ]
+    )
+    return T_world_cam, rng.uniform((-2, -1.5, 5), (4, 1.5, 12), (NUM_POINTS, 3))
+
+
+def solved_window(noise_px, sigma_px, points=None):
+    """A window seen with noise ``(M, 2)`` and solved from the truth: with its covariances, and the truth."""
+    T_world_cam, xyz = scene()
+    cam = np.stack([transform_points(invert_transform(T), xyz) for T in T_world_cam]).reshape(-1, 3)
+    kept = np.ones(len(VIEW), bool) if points is None else points > POINT
+    window = Window(
+        camera=CAMERA,
+        free=np.arange(NUM_VIEWS) >= 2,
+        num_points=int(POINT[kept].max()) + 1,
+        view=VIEW[kept],
+        point=POINT[kept],
+        xy=(CAMERA.project(cam) + noise_px)[kept],
+        whitener=np.repeat(np.eye(2)[:, :, None] / sigma_px, int(kept.sum()), axis=2),
+        limit=np.full(int(kept.sum()), 1e3),
+        baseline=None,
+    )
+    state = minimise(window, State(T_world_cam, xyz[: window.num_points]), 10)
+    return window, state, window_covariance(window, state), (T_world_cam, xyz[: window.num_points])
+
+
+def last_error(state, truth):
+    """The last view's error as a similarity in its frame: twist, and what is missing to the depths."""
+    T_cam_true = invert_transform(state.T_world_cam[-1]) @ truth[0][-1]
+    turn = 0.5 * np.array([T_cam_true[2, 1] - T_cam_true[1, 2], T_cam_true[0, 2] - T_cam_true[2, 0],
+                           T_cam_true[1, 0] - T_cam_true[0, 1]])  # fmt: skip
+    z_true, z_found = (
+        transform_points(invert_transform(T[-1]), xyz)[:, 2] for T, xyz in (truth, vars(state).values())
+    )
+    return np.array([*turn, *T_cam_true[:3, 3], np.mean(np.log(z_true / z_found))])
+
+
+def stated_over_true(draw_noise, sigma_px, num=50):
+    """Root mean squares of the last view's errors over what was stated, ``(7,)``."""
+    errors, variances = [], []
+    for seed in range(num):
+        _, state, covariances, truth = solved_window(draw_noise(np.random.default_rng(seed)), sigma_px)
+        errors.append(last_error(state, truth))
+        variances.append(np.diag(covariances[-1]))
+    return np.sqrt(np.square(errors).mean(axis=0) / np.mean(variances, axis=0))
+
+
+def test_errors_that_are_independent_are_as_large_as_stated():
+    ratio = stated_over_true(lambda rng: rng.normal(0, 0.5, (len(VIEW), 2)), 0.5)
+    np.testing.assert_allclose(ratio, 1.0, atol=0.3)
+
+
+def shared_by_neighbours(rng):
+    """What is followed on one part of a surface slides along with it, from view to view."""
+    groups = groups_by_place(scene()[1])
+    group_of = np.zeros(NUM_POINTS, int)
+    for row, points in enumerate(groups):
+        group_of[points] = row
+    slid = np.cumsum(rng.normal(0, 0.4, (NUM_VIEWS, len(groups), 2)), axis=0)
+    return slid[VIEW, group_of[POINT]] + rng.normal(0, 0.1, (len(VIEW), 2))
+
+
+def test_errors_that_neighbours_share_are_as_large_as_stated(monkeypatch):
+    ratio = stated_over_true(shared_by_neighbours, 1.0)
+    np.testing.assert_allclose(ratio, 1.0, atol=0.3)
+    monkeypatch.setattr(covariance_of_window, "_MIN_GROUPS", 99)
+    alone = stated_over_true(shared_by_neighbours, 1.0)
+    assert alone[:3].max() > 1.7, "the information alone says that they average out"
+
+
+def test_few_landmarks_say_what_their_information_is_worth():
+    window, state, covariances, _ = solved_window(np.zeros((len(VIEW), 2)), 0.5, points=12)
+    system = linearise(window, state, slopes_at(window, see(window, state))).reduced(0.0)[0]
+    np.testing.assert_allclose(covariances[-1, :6, :6], np.linalg.inv(system)[-6:, -6:], rtol=1e-6)
+    assert not covariances[:2].any(), "views that are held"
+
+
+def test_the_scale_is_that_of_the_depths():
+    # By hand: views and points move as they like by a small similarity about the last camera.
+    window, state, _, _ = solved_window(np.zeros((len(VIEW), 2)), 0.5)
+    seen = see(window, state)
+    normal = linearise(window, state, slopes_at(window, seen))
+    _, factor, scaled = normal.reduced(0.0)
+    ends, own = covariance_of_window._ends(window, seen, factor, scaled)
+    assert ends.shape == (4, 7, 24)
+    # A step of the last camera alone along its axis, with the landmarks where that leaves them.
+    twist = np.zeros(24)
+    twist[-1] = 1e-4
+    moved = state.T_world_cam.copy()
+    moved[-1] = moved[-1] @ exp_se3(twist[-6:])
+    xyz = state.xyz - (np.einsum("pji,pj->pi", factor, (scaled @ twist).reshape(-1, 3)))
+    log_z = [np.log(transform_points(invert_transform(T), p)[:, 2]) for T, p in
+             ((state.T_world_cam[-1], state.xyz), (moved[-1], xyz))]  # fmt: skip
+    by_point = np.einsum(
+        "pij,pj->pi", factor, seen.R_cam_world[2].T[-NUM_POINTS:] / seen.points_cam[2][-NUM_POINTS:, None]
+    )
+    share = 1.0 / np.square(by_point).sum(axis=1)
+    share /= share.sum()
+    assert ends[-1, 6] @ twist == pytest.approx(share @ (log_z[1] - log_z[0]), rel=1e-3)
+    assert own[-1] == pytest.approx(1.0 / (1.0 / np.square(by_point).sum(axis=1)).sum())
+
+
+def test_a_window_that_nothing_fixes_has_no_covariance():
+    window, state, _, _ = solved_window(np.zeros((len(VIEW), 2)), 0.5)
+    assert window_covariance(replace(window, free=np.ones(NUM_VIEWS, bool)), state) is None
+    assert window_covariance(replace(window, free=np.arange(NUM_VIEWS) < 2), state) is None, (
+        "the last is held"
+    )
+
+
+def test_groups_are_neighbours_and_alike_in_number():
+    xyz = np.random.default_rng(0).uniform(0, 1, (161, 3))
+    groups = groups_by_place(xyz)
+    assert len(groups) == 16
+    assert sorted(np.concatenate(groups).tolist()) == list(range(161))
+    assert {len(g) for g in groups} == {10, 11}
+    assert max(np.ptp(xyz[g], axis=0).prod() for g in groups) < 0.15
+    assert len(groups_by_place(xyz[:31])) == 4
+    assert len(groups_by_place(xyz[:7])) == 1
