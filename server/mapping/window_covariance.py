@@ -148,9 +148,9 @@ def _ends(window: Window, seen: Seen, factor: Array, scaled: Array) -> tuple[Arr
     by_point = np.einsum("mij,jm->mi", factor[point], seen.R_cam_world[2].take(rows, axis=1) / z)
     information = 1.0 / np.square(by_point).sum(axis=1)
     share = information / np.maximum(summed(view, information, num_views), 1e-300)[view]
-    landmarks = np.zeros((num_views, window.num_points, 3))
-    landmarks[view, point] = share[:, None] * by_point
-    landmarks = landmarks.reshape(num_views, -1)
+    by_landmarks = np.zeros((num_views, window.num_points, 3))
+    by_landmarks[view, point] = share[:, None] * by_point
+    landmarks = by_landmarks.reshape(num_views, -1)
     ends = np.zeros((num_views, 7, count))
     ends[:, 6] = -landmarks @ scaled
     for k in range(num_views):
