@@ -3,7 +3,7 @@
 An adjustment says how well its keyframes are known against the older ones that hold it, and those were known
 no better against others when they were adjusted. A keyframe's covariance is that of its window, and behind
 it that of the keyframes that held the window, carried to it: the scale goes with it, so that a length that
-crept in lets the place drift for as long as the camera moves away.
+crept in lets the place drift for as long as the camera moves away. The first keyframes set the unit.
 """
 
 from collections.abc import Collection, Mapping

@@ -36,12 +36,14 @@ _LEFT_OUT = 0.9
 _SHARE_OF_INFORMATION = 0.2
 
 
-def window_covariance(window: Window, state: State) -> Array | None:
+def window_covariance(window: Window, state: State, *, sets_unit: bool = False) -> Array | None:
     """How well each view is known against those that are not adjusted.
 
     Args:
         window: What was adjusted.
         state: Where that ended.
+        sets_unit: The unit of length is what the views see alike, not what those that are held say: these are
+            the first of a map, and close together.
 
     Returns:
         ``(K, 7, 7)`` covariances of a similarity in each camera's frame: turn in radians, place in map units,
@@ -62,15 +64,29 @@ def window_covariance(window: Window, state: State) -> Array | None:
     except np.linalg.LinAlgError:
         return None
     ends, own_variance = _ends(window, seen, factor, scaled)
-    found = ends @ inverse @ ends.transpose(0, 2, 1)
+    spread = inverse
     if len(moves) >= _MIN_GROUPS:
-        moved = ends @ moves.T
-        spread = moved @ moved.transpose(0, 2, 1) * (1.0 - 1.0 / len(moves))
-        found = _SHARE_OF_INFORMATION * found + (1.0 - _SHARE_OF_INFORMATION) * spread
+        spread = (1.0 - 1.0 / len(moves)) * moves.T @ moves
+        spread = _SHARE_OF_INFORMATION * inverse + (1.0 - _SHARE_OF_INFORMATION) * spread
+    if sets_unit:
+        ends = _in_own_unit(ends, state.T_world_cam[window.free], state.T_world_cam[~window.free][0])
+    found = ends @ spread @ ends.transpose(0, 2, 1)
     found[:, 6, 6] += own_variance
     covariances = np.zeros((len(window.free), 7, 7))
     covariances[window.free] = found
     return covariances if np.isfinite(covariances).all() else None
+
+
+def _in_own_unit(ends: Array, T_world_cam: Array, T_world_first: Array) -> Array:
+    """What is asked of views ``(V, 7, C)``, in the unit that is what they see alike in the mean.
+
+    Lengths from the first camera on change with the unit, turns do not.
+    """
+    unit = ends[:, 6].mean(axis=0)
+    way = np.einsum("vji,vj->vi", T_world_cam[:, :3, :3], T_world_cam[:, :3, 3] - T_world_first[:3, 3])
+    by_unit = np.zeros((len(ends), 7))
+    by_unit[:, 3:6], by_unit[:, 6] = way, 1.0
+    return np.asarray(ends - by_unit[:, :, None] * unit)
 
 
 def groups_by_place(xyz: Array) -> list[NDArray[np.intp]]:

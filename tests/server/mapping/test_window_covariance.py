@@ -26,7 +26,7 @@ def scene():
     return T_world_cam, rng.uniform((-2, -1.5, 5), (4, 1.5, 12), (NUM_POINTS, 3))
 
 
-def solved_window(noise_px, sigma_px, points=None):
+def solved_window(noise_px, sigma_px, points=None, *, sets_unit=False):
     """A window seen with noise ``(M, 2)`` and solved from the truth: with its covariances, and the truth."""
     T_world_cam, xyz = scene()
     cam = np.stack([transform_points(invert_transform(T), xyz) for T in T_world_cam]).reshape(-1, 3)
@@ -43,7 +43,8 @@ def solved_window(noise_px, sigma_px, points=None):
         baseline=None,
     )
     state = minimise(window, State(T_world_cam, xyz[: window.num_points]), 10)
-    return window, state, window_covariance(window, state), (T_world_cam, xyz[: window.num_points])
+    covariances = window_covariance(window, state, sets_unit=sets_unit)
+    return window, state, covariances, (T_world_cam, xyz[: window.num_points])
 
 
 def last_error(state, truth):
@@ -57,19 +58,43 @@ def last_error(state, truth):
     return np.array([*turn, *T_cam_true[:3, 3], np.mean(np.log(z_true / z_found))])
 
 
-def stated_over_true(draw_noise, sigma_px, num=50):
+def in_own_unit(state, truth):
+    """The state in the unit in which views see what they see as far away as it is, in the mean."""
+    logs = [
+        np.log(transform_points(invert_transform(T), truth[1])[:, 2]).mean()
+        - np.log(transform_points(invert_transform(T_found), state.xyz)[:, 2]).mean()
+        for T, T_found in zip(truth[0][2:], state.T_world_cam[2:], strict=True)
+    ]
+    unit, first = np.exp(np.mean(logs)), truth[0][0, :3, 3]
+    T_world_cam = state.T_world_cam.copy()
+    T_world_cam[:, :3, 3] = first + unit * (T_world_cam[:, :3, 3] - first)
+    return State(T_world_cam, first + unit * (state.xyz - first))
+
+
+def true_over_stated(draw_noise, sigma_px, num=50, *, sets_unit=False):
     """Root mean squares of the last view's errors over what was stated, ``(7,)``."""
     errors, variances = [], []
     for seed in range(num):
-        _, state, covariances, truth = solved_window(draw_noise(np.random.default_rng(seed)), sigma_px)
+        noise = draw_noise(np.random.default_rng(seed))
+        _, state, covariances, truth = solved_window(noise, sigma_px, sets_unit=sets_unit)
+        state = in_own_unit(state, truth) if sets_unit else state
         errors.append(last_error(state, truth))
         variances.append(np.diag(covariances[-1]))
     return np.sqrt(np.square(errors).mean(axis=0) / np.mean(variances, axis=0))
 
 
 def test_errors_that_are_independent_are_as_large_as_stated():
-    ratio = stated_over_true(lambda rng: rng.normal(0, 0.5, (len(VIEW), 2)), 0.5)
+    ratio = true_over_stated(lambda rng: rng.normal(0, 0.5, (len(VIEW), 2)), 0.5)
     np.testing.assert_allclose(ratio, 1.0, atol=0.3)
+
+
+def test_a_window_that_sets_the_unit_is_off_by_what_is_left_in_that_unit():
+    draw_noise = lambda rng: rng.normal(0, 0.5, (len(VIEW), 2))  # noqa: E731
+    np.testing.assert_allclose(true_over_stated(draw_noise, 0.5, sets_unit=True)[:6], 1.0, atol=0.3)
+    noise = draw_noise(np.random.default_rng(0))
+    held, own = (solved_window(noise, 0.5, sets_unit=sets_unit)[2][-1] for sets_unit in (False, True))
+    np.testing.assert_allclose(own[:3, :3], held[:3, :3], rtol=1e-9, err_msg="turns have no unit")
+    assert own[6, 6] < 0.3 * held[6, 6]
 
 
 def shared_by_neighbours(rng):
@@ -83,10 +108,10 @@ def shared_by_neighbours(rng):
 
 
 def test_errors_that_neighbours_share_are_as_large_as_stated(monkeypatch):
-    ratio = stated_over_true(shared_by_neighbours, 1.0)
+    ratio = true_over_stated(shared_by_neighbours, 1.0)
     np.testing.assert_allclose(ratio, 1.0, atol=0.3)
     monkeypatch.setattr(covariance_of_window, "_MIN_GROUPS", 99)
-    alone = stated_over_true(shared_by_neighbours, 1.0)
+    alone = true_over_stated(shared_by_neighbours, 1.0)
     assert alone[:3].max() > 1.7, "the information alone says that they average out"
 
 
