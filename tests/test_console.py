@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from rich.table import Table
 
 import semcast
 from semcast.cli import main
@@ -19,13 +20,22 @@ def test_brackets_and_colons_are_no_styles(text, capsys):
 
 
 def test_what_is_piped_is_not_folded(monkeypatch, capsys):
-    line = "a word " * 60
+    line = ("a word " * 60).rstrip()
     monkeypatch.delenv("COLUMNS", raising=False)
     plain_console().print(line)
     assert capsys.readouterr().out == f"{line}\n"
     monkeypatch.setenv("COLUMNS", "100")
     plain_console().print(line)
     assert max(map(len, capsys.readouterr().out.splitlines())) <= 100
+
+
+def test_lines_of_a_piped_table_end_where_their_text_does(monkeypatch, capsys):
+    monkeypatch.delenv("COLUMNS", raising=False)
+    table = Table(show_header=False, box=None)
+    table.add_row("short")
+    table.add_row("a good deal longer")
+    plain_console().print(table)
+    assert [line.lstrip() for line in capsys.readouterr().out.splitlines()] == ["short", "a good deal longer"]
 
 
 def test_verbs_print_through_no_other_console():
