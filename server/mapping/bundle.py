@@ -163,9 +163,8 @@ def optimise(problem: BundleProblem) -> BundleResult:
     covariances = None
     if ok and problem.with_covariance:
         window, _, points = _window_of(problem, used)
-        covariances = window_covariance(
-            window, State(T_world_cam, xyz[points]), sets_unit=problem.num_anchors == 0
-        )
+        adjusted = State(T_world_cam, xyz[points])
+        covariances = window_covariance(window, adjusted, sets_unit=problem.sets_unit)
     pattern_products = None
     if ok and problem.motion is not None:
         pattern_products = pattern_products_of(problem, problem.motion, T_world_cam, xyz, residual)

@@ -61,7 +61,8 @@ class BundleProblem:
         iterations: Levenberg-Marquardt steps at most.
         num_anchors: So many of the first keyframes are of long ago; they are held, and only what the others
             see is adjusted.
-        with_covariance: Whether it is wanted how well the poses are known.
+        with_covariance: Whether it is wanted how well the poses are known,
+        sets_unit: and whether that is in the unit that the keyframes set, see ``window_covariance``.
         huber_px: See ``NoiseModel``.
         edge: ``(M, 2)`` of each observation, see ``edges``.
         motion: Of the views, where it is wanted what the residuals say about shutter and lens.
@@ -84,6 +85,7 @@ class BundleProblem:
     iterations: int = 6
     num_anchors: int = 0
     with_covariance: bool = True
+    sets_unit: bool = False
     huber_px: float | None = None
     motion: ViewMotion | None = None
     edge: Array = field(default_factory=alike)

@@ -111,7 +111,8 @@ def build_problem(
         keep_baseline=keep_baseline,
         iterations=iterations,
     )
-    return replace(problem, num_anchors=len(anchors), with_covariance=True)
+    is_whole = len(recent) == len(mine)
+    return replace(problem, num_anchors=len(anchors), with_covariance=True, sets_unit=is_whole)
 
 
 def _tell_scale(world: WorldMap, holding: list[Keyframe]) -> bool:

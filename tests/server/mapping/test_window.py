@@ -126,6 +126,7 @@ def test_the_first_adjustment_of_a_map_is_held_by_a_pose_and_a_distance():
         problem = build_problem(world, CAMERA, NOISE, 10, start=start)
         assert problem.fixed.tolist() == [True, not start, False, False]
         assert problem.keep_baseline == start
+        assert problem.sets_unit
 
 
 def test_a_window_whose_newest_held_keyframe_sees_no_landmark_is_held_as_others_are():
@@ -161,7 +162,9 @@ def test_keyframes_before_the_window_keep_its_scale_where_keyframes_are_dense(mo
 def test_a_window_of_some_extent_is_not_held_by_the_start_of_the_map(step, first_held):
     world, points, _ = make_world(num_keyframes=14, step=step)
     put_landmarks(world, points)
-    assert (build_problem(world, CAMERA, NOISE, 10).num_anchors > 0) == (first_held == 0)
+    problem = build_problem(world, CAMERA, NOISE, 10)
+    assert (problem.num_anchors > 0) == (first_held == 0)
+    assert not problem.sets_unit, "keyframes before it did, whether they hold it or not"
     world, points, _ = make_world(num_keyframes=34, step=step)
     put_landmarks(world, points)
     problem = build_problem(world, CAMERA, NOISE, 10)
