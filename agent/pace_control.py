@@ -19,6 +19,8 @@ logger = logging.getLogger(__name__)
 START_HZ = 12.0
 #: By then it is seen how many a camera gives: in the dark fewer than it says, over a network any number.
 _START_S = 1.0
+#: From so many steps between frames, all but the longest: a camera may pause after its first frame.
+_START_STEPS = 8
 #: A camera of 30 Hz before a server that takes a second a frame.
 MAX_STRIDE = 30
 #: Reports a decision is made from, at least,
@@ -67,7 +69,7 @@ class PaceControl:
         self._quiet = 0
         self._num_reports = self._since_change = 0
         self._num_captured = 0
-        self._begun_ns: int | None = None
+        self._captured_ns: list[int] = []  # of the first frames, until it is seen how many the source gives
         self._is_start = self._stride > 1
         self._captured_at_sent: deque[int] = deque(maxlen=_MAX_REPORTS)
         self._first_ns: int | None = None  # capture of the first frame that is reported on and counts,
@@ -100,13 +102,16 @@ class PaceControl:
 
     def _check_start(self, t_capture_ns: int) -> None:
         """Send more from the first second on where the source gives fewer frames than it said."""
-        if self._begun_ns is None:
-            self._begun_ns = t_capture_ns
-        elapsed_s = (t_capture_ns - self._begun_ns) * 1e-9
-        if not self._is_start or elapsed_s < _START_S:
+        if not self._is_start:
             return
-        self._is_start = False
-        self._stride = min(self._stride, start_stride(self._num_captured / elapsed_s))
+        self._captured_ns.append(t_capture_ns)
+        since_begun_s = (t_capture_ns - self._captured_ns[0]) * 1e-9
+        if since_begun_s < _START_S or len(self._captured_ns) <= _START_STEPS:
+            return
+        steps_ns = sorted(b - a for a, b in pairwise(self._captured_ns))[:-1]
+        self._is_start, self._captured_ns = False, []
+        given_hz = len(steps_ns) / max(1e-9 * sum(steps_ns), 1e-9)
+        self._stride = min(self._stride, start_stride(given_hz))
         self._captured_at_sent.clear()
 
     def on_sent(self) -> None:

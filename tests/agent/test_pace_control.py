@@ -190,6 +190,13 @@ def test_a_camera_that_gives_fewer_images_than_it_says_is_thinned_by_what_it_giv
     assert pace.stride == stride
 
 
+def test_a_camera_that_pauses_after_its_first_frame_is_not_taken_for_a_slow_one():
+    pace = PaceControl(1, 30.0)
+    for t_s in (0.0, *(1.5 + k * PERIOD_S for k in range(60))):
+        pace.wants(round(t_s * 1e9))
+    assert pace.stride == 3
+
+
 class Reports:
     """Reports on every frame of a source, each with so many passed over since the one before."""
 
