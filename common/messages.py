@@ -335,8 +335,8 @@ class PoseMessage(_Versioned):
     Attributes:
         T_world_cam: 4x4, row by row, or None while it is not known.
         state: Of the tracker. It goes on tracking after images that show nothing, which have no pose.
-        covariance: 6x6, row by row, rotation before translation, or None. In a part of the map whose place is
-            guessed it tells what the guess is worth as well.
+        covariance: 6x6, row by row, rotation before translation, or None: against the start of the map, with
+            what adds up on the way and, in a part whose place is guessed, what the guess is worth.
         map_epoch: Counts map resets; poses of two epochs have unrelated world frames.
         submap: Part of the map the frame belongs to. A new part's place and scale in the world are guessed
             until it meets an older one and becomes part of it.

@@ -50,7 +50,7 @@ The map
     new_landmarks     tracks of keyframes, triangulated
     observations      what keyframes saw of some tracks
     drift             how far keyframes may be off against the start, which adds up on the way
-    pose_covariance   how well a pose is known, against the newest keyframes and with these in the world
+    pose_covariance   how well a pose is known, against the newest keyframes and the start of the map
     scene_depth       how far away the scene is
     thinning          what goes when the map reaches its limits
     keyframe_images   images of keyframes, kept to look for landmarks by how they looked there
@@ -63,8 +63,8 @@ Bundle adjustment
     bundle_problem    the problem and its result, as plain arrays
     bundle            solves a problem: dense for small ones, GTSAM for the rest
     dense_bundle      Levenberg-Marquardt with the Schur complement in numpy
-    window_covariance how well its keyframes are known, with errors that neighbours share (jackknife)
     bundle_process    the same in a process of its own
+    window_covariance how well a window's keyframes are known, with errors that neighbours share (jackknife)
     adjustment        brings the result into the map, and lets what it had no room for follow
     whole_map         the adjustment of all keyframes at the end of a stream
     steps             relative poses that tracking found, as constraints between keyframes

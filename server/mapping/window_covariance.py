@@ -30,7 +30,8 @@ _MAX_GROUPS = 16
 _MIN_GROUPS = 4
 #: and no group has fewer landmarks.
 _LEAST_IN_GROUP = 4
-#: How much of a group is left out, so that what only it fixes stays fixed.
+#: How much of a group is left out, so that what only it fixes stays fixed: at least a tenth of all there was
+#: to know is left of any pose.
 _LEFT_OUT = 0.9
 #: Share of the information's word in the variance; the groups have no word on what none of them moves.
 _SHARE_OF_INFORMATION = 0.2
@@ -107,6 +108,9 @@ def _moves_without_each(
 ) -> Array:
     """Twists of all poses ``(G, C)`` when a group of landmarks is left out, one group in each row.
 
+    It is a step of Gauss and Newton, negated, and for a whole group even where only a part of it is left out.
+    What the window's own end is short of the minimum by is not in it.
+
     Args:
         window: What was adjusted.
         state: Where that ended.
@@ -116,7 +120,7 @@ def _moves_without_each(
         scaled_right: ``(P, 3)``, right sides of the points, multiplied by the same factors.
 
     Raises:
-        LinAlgError: Without a group nothing fixes the window.
+        LinAlgError: The window is all but free, so that rounding leaves a system singular.
     """
     groups, count = groups_by_place(state.xyz), len(system)
     group_of = np.zeros(window.num_points, np.intp)

@@ -123,28 +123,45 @@ def test_few_landmarks_say_what_their_information_is_worth():
 
 
 def test_the_scale_is_that_of_the_depths():
-    # By hand: views and points move as they like by a small similarity about the last camera.
+    # By hand: views turn and step as they like, and landmarks go where that leaves them.
     window, state, _, _ = solved_window(np.zeros((len(VIEW), 2)), 0.5)
     seen = see(window, state)
     normal = linearise(window, state, slopes_at(window, seen))
     _, factor, scaled = normal.reduced(0.0)
     ends, own = covariance_of_window._ends(window, seen, factor, scaled)
     assert ends.shape == (4, 7, 24)
-    # A step of the last camera alone along its axis, with the landmarks where that leaves them.
-    twist = np.zeros(24)
-    twist[-1] = 1e-4
+    twists = np.random.default_rng(2).normal(0, 1e-5, 24)
     moved = state.T_world_cam.copy()
-    moved[-1] = moved[-1] @ exp_se3(twist[-6:])
-    xyz = state.xyz - (np.einsum("pji,pj->pi", factor, (scaled @ twist).reshape(-1, 3)))
-    log_z = [np.log(transform_points(invert_transform(T), p)[:, 2]) for T, p in
-             ((state.T_world_cam[-1], state.xyz), (moved[-1], xyz))]  # fmt: skip
-    by_point = np.einsum(
-        "pij,pj->pi", factor, seen.R_cam_world[2].T[-NUM_POINTS:] / seen.points_cam[2][-NUM_POINTS:, None]
-    )
-    share = 1.0 / np.square(by_point).sum(axis=1)
-    share /= share.sum()
-    assert ends[-1, 6] @ twist == pytest.approx(share @ (log_z[1] - log_z[0]), rel=1e-3)
-    assert own[-1] == pytest.approx(1.0 / (1.0 / np.square(by_point).sum(axis=1)).sum())
+    moved[2:] = moved[2:] @ exp_se3(twists.reshape(4, 6))
+    xyz = state.xyz - np.einsum("pji,pj->pi", factor, (scaled @ twists).reshape(-1, 3))
+    by_view = zip(state.T_world_cam[2:], moved[2:], ends, own, strict=True)
+    for k, (T_before, T_after, ends_of_view, own_of_view) in enumerate(by_view):
+        z, z_after = (
+            transform_points(invert_transform(T), p)[:, 2] for T, p in ((T_before, state.xyz), (T_after, xyz))
+        )
+        by_point = np.einsum("pij,pj->pi", factor, T_before[:3, 2] / z[:, None])
+        share = 1.0 / np.square(by_point).sum(axis=1)
+        assert own_of_view == pytest.approx(1.0 / share.sum())
+        longer = share @ np.log(z_after / z) / share.sum()
+        assert ends_of_view[6] @ twists == pytest.approx(longer, rel=1e-3)
+        np.testing.assert_array_equal(ends_of_view[:6] @ twists, twists[6 * k : 6 * k + 6])
+
+
+def test_without_a_group_poses_move_as_a_window_with_little_weight_on_it_would():
+    noise = np.random.default_rng(3).normal(0, 1.0, (len(VIEW), 2))
+    window, state, _, _ = solved_window(noise, 1.0)
+    state = minimise(window, state, 20)
+    slopes = slopes_at(window, see(window, state))
+    normal = linearise(window, state, slopes)
+    system, factor, scaled = normal.reduced(0.0)
+    right = np.einsum("pij,pj->pi", factor, normal.right_points)
+    moves = covariance_of_window._moves_without_each(window, state, slopes, system, scaled, right)
+    left_out = covariance_of_window._LEFT_OUT
+    for points, move in zip(groups_by_place(state.xyz), moves, strict=True):
+        weight = np.where(np.isin(window.point, points), np.sqrt(1.0 - left_out), 1.0)
+        lighter = replace(window, whitener=window.whitener * weight)
+        twists = linearise(lighter, state, slopes_at(lighter, see(lighter, state))).step(0.0)[0]
+        np.testing.assert_allclose(-left_out * move, twists, atol=1e-3 * np.abs(moves).max())
 
 
 def test_a_window_that_nothing_fixes_has_no_covariance():
