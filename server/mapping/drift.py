@@ -21,7 +21,8 @@ Array = NDArray[np.float64]
 class Drift:
     """Covariances ``(7, 7)`` of a similarity in a keyframe's frame: turn, place, logarithm of the scale.
 
-    A keyframe that was never adjusted has none: the first of a part, which all others are told against.
+    That of the first keyframe of a part, which all others are told against, is zero. Others that were never
+    adjusted have none.
     """
 
     def __init__(self) -> None:
@@ -34,8 +35,8 @@ class Drift:
     def take(self, result: BundleResult) -> None:
         """Take what an adjustment says of its keyframes.
 
-        Those that hold it count by how much they see of it. Their errors are not independent, so that the
-        mean of several is no better than one of them.
+        Those that hold it count by how much they see of it; where nothing is known of one, the others count.
+        Their errors are not independent, so that the mean of several is no better than one of them.
         """
         if result.covariances is None:
             return
@@ -43,13 +44,16 @@ class Drift:
         frame_ids = problem.keyframe_ids.tolist()
         held = np.flatnonzero(problem.fixed).tolist()
         count = np.bincount(problem.view, minlength=len(frame_ids))
+        if problem.sets_unit:
+            for k in held:
+                self._covariance.setdefault(frame_ids[k], np.zeros((7, 7)))
+        held = [k for k in held if frame_ids[k] in self._covariance]
         share = count[held] / max(int(count[held].sum()), 1)
         rows = np.flatnonzero(~problem.fixed).tolist()
         # All of it as one of the first keyframe, and from there to the others: each with each takes 10 ms.
         behind = np.zeros((7, 7))
         for k, s in zip(held, share.tolist(), strict=True):
-            if (covariance := self._covariance.get(frame_ids[k])) is not None:
-                behind += s * _carried(covariance, T[k], T[rows[0]])
+            behind += s * _carried(self._covariance[frame_ids[k]], T[k], T[rows[0]])
         for row in rows:
             self._covariance[frame_ids[row]] = result.covariances[row] + _carried(behind, T[rows[0]], T[row])
 
@@ -76,16 +80,19 @@ class Drift:
                 added = _carried(leader, poses[leader_id], poses[frame_id])
                 self._covariance[frame_id] = self._covariance[frame_id] + added
 
-    def close(self, since_id: int, until_id: int, poses: Mapping[int, Array]) -> None:
+    def close(
+        self, since_id: int, until_id: int, frame_ids: Collection[int], poses: Mapping[int, Array]
+    ) -> None:
         """A loop was closed: its last keyframe is known as well as its first, and more so the nearer to it.
 
         Args:
             since_id: Keyframe of the place the camera came back to.
             until_id: Keyframe that came back.
+            frame_ids: Keyframes of the part it is in.
             poses: ``T_world_cam`` by frame id, where they are now.
         """
         first = self._covariance.get(since_id, np.zeros((7, 7)))
-        loop = sorted(k for k in self._covariance if since_id < k <= until_id)
+        loop = sorted(k for k in frame_ids if since_id < k <= until_id and k in self._covariance)
         for rank, frame_id in enumerate(loop, 1):
             known = rank / len(loop)
             mine = (1.0 - known) * self._covariance[frame_id]

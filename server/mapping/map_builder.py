@@ -270,7 +270,8 @@ class MapBuilder:
         self._abandon_adjustment()
         self.world.bend(keyframe_ids, solved.T_world_cam, solved.scale)
         self.world.revisits[loop.keyframe_id] = loop.place.keyframe_id
-        self.world.drift.close(loop.place.keyframe_id, loop.keyframe_id, self.world.poses)
+        ends = loop.place.keyframe_id, loop.keyframe_id
+        self.world.drift.close(*ends, keyframe_ids.tolist(), self.world.poses)
         self._on_moved(float(solved.scale[-1]))
         logger.info("keyframe %d: a loop is closed, to keyframe %d", loop.keyframe_id, loop.place.keyframe_id)
         return True
@@ -467,7 +468,7 @@ class MapBuilder:
             return None
         self._abandon_adjustment()
         moving, staying = (self.submap, place.submap) if is_newer else (place.submap, self.submap)
-        moved_ids = [k for k, part in self.world.submap_of.items() if part == moving]
+        moved_ids = [k.frame_id for k in self.world.keyframes_of(moving)]
         leader_id = place.keyframe_id if is_newer else self.world.keyframes_of(staying)[-1].frame_id
         self.world.transform_submap(moving, staying, *join)
         self.world.drift.follow(moved_ids, leader_id, self.world.poses)

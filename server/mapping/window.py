@@ -111,7 +111,8 @@ def build_problem(
         keep_baseline=keep_baseline,
         iterations=iterations,
     )
-    is_whole = len(recent) == len(mine)
+    # Of a map that was thinned out, the newest keyframes may be all that is left.
+    is_whole = len(recent) == len(mine) == sum(part == submap for part in world.submap_of.values())
     return replace(problem, num_anchors=len(anchors), with_covariance=True, sets_unit=is_whole)
 
 

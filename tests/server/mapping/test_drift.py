@@ -24,11 +24,13 @@ def pose(x, turned_deg=0.0):
     return make_transform(exp_so3((0.0, 0.0, np.radians(turned_deg))), (x, 0.0, 0.0))
 
 
-def adjusted(frame_ids, fixed, covariances, poses, seen=None):
+def adjusted(frame_ids, fixed, covariances, poses, seen=None, *, sets_unit=False):
     """What an adjustment says; ``seen`` is how often each keyframe sees the window."""
     seen = seen or [1] * len(frame_ids)
     view = np.repeat(np.arange(len(frame_ids)), seen)
-    problem = SimpleNamespace(keyframe_ids=np.array(frame_ids), fixed=np.array(fixed), view=view)
+    problem = SimpleNamespace(
+        keyframe_ids=np.array(frame_ids), fixed=np.array(fixed), view=view, sets_unit=sets_unit
+    )
     return SimpleNamespace(
         problem=problem,
         T_world_cam=np.stack(list(poses)),
@@ -45,9 +47,9 @@ NONE = np.zeros((7, 7))
 
 def test_what_holds_a_window_is_behind_what_the_window_says():
     drift = Drift()
-    drift.take(adjusted([0, 5], [True, False], [NONE, of_window()], [pose(0), pose(1)]))
+    drift.take(adjusted([0, 5], [True, False], [NONE, of_window()], [pose(0), pose(1)], sets_unit=True))
     np.testing.assert_allclose(drift.of(5), of_window())
-    assert drift.of(0) is None, "all is told against it"
+    np.testing.assert_array_equal(drift.of(0), NONE, err_msg="all is told against it")
     drift.take(adjusted([5, 9], [True, False], [NONE, of_window()], [pose(1), pose(3)]))
     # Two units on, a turn moves by twice its angle to the sides, and the scale by twice its share along.
     carried = [2 * 0.01**2] * 3 + [2 * 0.02**2 + (2 * 0.03) ** 2] + [2 * 0.02**2 + (2 * 0.01) ** 2] * 2
@@ -56,9 +58,13 @@ def test_what_holds_a_window_is_behind_what_the_window_says():
 
 def test_keyframes_that_hold_a_window_count_by_what_they_see_of_it():
     drift = Drift()
-    drift.take(adjusted([0, 5], [True, False], [NONE, of_window(place=1.0)], [pose(0)] * 2))
-    drift.take(adjusted([0, 5, 9], [True, True, False], [NONE, NONE, NONE], [pose(0)] * 3, seen=[30, 10, 50]))
+    start = adjusted([0, 5], [True, False], [NONE, of_window(place=1.0)], [pose(0)] * 2, sets_unit=True)
+    holding = [True, True, False], [NONE, NONE, NONE], [pose(0)] * 3, [30, 10, 50]
+    drift.take(start)
+    drift.take(adjusted([0, 5, 9], *holding))
     np.testing.assert_allclose(drift.of(9), 0.25 * of_window(place=1.0))
+    drift.take(adjusted([3, 5, 12], *holding))
+    np.testing.assert_allclose(drift.of(12), of_window(place=1.0), err_msg="nothing is known of one of them")
 
 
 def test_an_adjustment_that_fixed_nothing_changes_nothing():
@@ -72,7 +78,11 @@ def some_drift():
     poses = {10 * k: pose(k) for k in range(5)}
     drift.take(
         adjusted(
-            list(poses), [True] + [False] * 4, [NONE] + [k * of_window() for k in range(1, 5)], poses.values()
+            list(poses),
+            [True] + [False] * 4,
+            [NONE] + [k * of_window() for k in range(1, 5)],
+            poses.values(),
+            sets_unit=True,
         )
     )
     return drift, poses
@@ -92,7 +102,10 @@ def test_a_part_that_was_put_in_place_by_another_is_off_by_what_that_is():
     carried = similarity_adjoint(pose(2))
     np.testing.assert_allclose(drift.of(30), 3 * of_window() + carried @ of_window() @ carried.T)
     np.testing.assert_allclose(drift.of(20), 2 * of_window())
-    drift.follow([40], 0, poses)
+    drift.follow([0], 10, poses)
+    carried = similarity_adjoint(pose(-1))
+    np.testing.assert_allclose(drift.of(0), carried @ of_window() @ carried.T, err_msg="the first of a part")
+    drift.follow([40], 99, poses)
     assert drift.of(40)[0, 0] == pytest.approx(5 * 0.01**2), "the start is off by nothing"
 
 
@@ -100,7 +113,7 @@ def test_the_end_of_a_loop_is_known_as_well_as_its_place():
     drift, poses = some_drift()
     before = drift.of(30).copy()
     poses = {**poses, 40: pose(1.0)}
-    drift.close(10, 40, poses)
+    drift.close(10, 40, list(poses), poses)
     np.testing.assert_allclose(drift.of(10), of_window())
     np.testing.assert_allclose(drift.of(40), of_window(), atol=1e-12)
     carried = similarity_adjoint(pose(2)) @ of_window() @ similarity_adjoint(pose(2)).T
@@ -142,13 +155,21 @@ def builder():
 
 
 def test_a_map_that_closes_a_loop_is_known_there_as_its_place_is(builder, monkeypatch):
-    ids = np.arange(0, 50, 10)
-    bent = np.stack([pose(min(k, 1)) for k in range(5)])
-    solved = SolvedGraph(bent, np.array([1.0, 1.0, 1.0, 1.0, 2.0]), 0.0)
+    none, newest = np.zeros(0, np.int64), 200
+    builder.world.add_keyframe(Keyframe(newest, 0, pose(5), 0, none, np.zeros((0, 2)), np.zeros(0)))
+    drift = builder.world.drift.arrays()
+    frame_ids, covariances = [*drift["drift.frame_id"], newest], [*drift["drift.covariance"], of_window()]
+    builder.world.drift.restore(
+        {"drift.frame_id": np.array(frame_ids), "drift.covariance": np.stack(covariances)}
+    )
+    ids = np.array([0, 10, 20, 30, 40, newest])
+    bent = np.stack([pose(min(k, 1)) for k in range(6)])
+    solved = SolvedGraph(bent, np.array([1.0, 1.0, 1.0, 1.0, 1.0, 2.0]), 0.0)
     monkeypatch.setattr(map_builder, "share_out", lambda *_: (ids, solved))
-    assert builder._close(SimpleNamespace(keyframe_id=40, place=SimpleNamespace(keyframe_id=10)))
-    np.testing.assert_allclose(builder.world.drift.of(40), 11 * of_window())
+    assert builder._close(SimpleNamespace(keyframe_id=newest, place=SimpleNamespace(keyframe_id=10)))
+    np.testing.assert_allclose(builder.world.drift.of(newest), 11 * of_window())
     np.testing.assert_allclose(builder.world.drift.of(0), of_window())
+    np.testing.assert_allclose(builder.world.drift.of(140), 41 * of_window(), err_msg="another part")
     at_end = pose_covariance(builder.world, 0, 1e-9 * np.eye(6), pose(1))
     np.testing.assert_allclose(at_end, 1e-9 * np.eye(6) + 11 * of_window()[:6, :6])
 

@@ -127,6 +127,8 @@ def test_the_first_adjustment_of_a_map_is_held_by_a_pose_and_a_distance():
         assert problem.fixed.tolist() == [True, not start, False, False]
         assert problem.keep_baseline == start
         assert problem.sets_unit
+    world.bound(1000, 3, recent=3)
+    assert not build_problem(world, CAMERA, NOISE, 10).sets_unit, "it was set before one of them went"
 
 
 def test_a_window_whose_newest_held_keyframe_sees_no_landmark_is_held_as_others_are():
