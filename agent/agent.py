@@ -224,6 +224,7 @@ def _send_live(sending: _Sending, capture: Capture, stop: threading.Event) -> No
             continue
         if not frame.final and not sending.is_heard:
             sending.metrics.drop("unheard")
+            sending.metrics.be_at("")
             continue
         encoded = None
         with encoding:

@@ -305,13 +305,15 @@ def test_an_agent_encodes_nothing_while_nobody_takes_frames(bench):
     statuses = []
     key = status_key("agent0", "agent")
     bench.hub.subscribe(key, "newest", lambda p: statuses.append(unpack(p, StatusMessage)))
-    agent = bench.agent(source={"repeat": "loop"})
+    agent = bench.agent(rate="auto", source={"repeat": "loop"})
     before = take(receiver, count=1)[-1].message
+    until(lambda: statuses and "sending" in statuses[-1].activity)
     channel.end()
     until(lambda: statuses and statuses[-1].drops.get("unheard"))
     num_encoded, num_unheard = len(bench.codec.snrs_db), statuses[-1].drops["unheard"]
     until(lambda: statuses[-1].drops["unheard"] > num_unheard)
     assert len(bench.codec.snrs_db) == num_encoded
+    assert statuses[-1].activity == "", "it sends nothing"
     bench.channel()
     until(lambda: take(receiver, count=1)[-1].message.frame_id > before.frame_id + num_unheard)
     agent.end()
