@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from semcast.common.geometry import invert_transform
 from semcast.server.mapping.bundle_problem import BundleResult
-from semcast.server.mapping.guessed_place import similarity_adjoint
+from semcast.server.mapping.guessed_place import carried
 
 Array = NDArray[np.float64]
 
@@ -119,6 +119,5 @@ class Drift:
 
 
 def _carried(covariance: Array, T_world_from: Array, T_world_to: Array) -> Array:
-    """Covariance ``(7, 7)`` of one camera as one of another camera that moves with it."""
-    adjoint = similarity_adjoint(invert_transform(T_world_from) @ T_world_to)
-    return np.asarray(adjoint @ covariance @ adjoint.T)
+    """Covariance ``(7, 7)`` of one camera as one of another camera, of poses ``(4, 4)`` in the world."""
+    return carried(covariance, invert_transform(T_world_from) @ T_world_to)

@@ -33,8 +33,13 @@ class GuessedPlace:
         """Return the covariance ``(7, 7)`` in the frame of another camera, ``T_first_cam (4, 4)``."""
         if self.covariance is None:
             return None
-        carried = similarity_adjoint(T_first_cam)
-        return np.asarray(carried @ self.covariance @ carried.T)
+        return carried(self.covariance, T_first_cam)
+
+
+def carried(covariance: Array, T_first_cam: Array) -> Array:
+    """Covariance ``(7, 7)`` in a first camera's frame as one in that of a camera that moves with it."""
+    adjoint = similarity_adjoint(T_first_cam)
+    return np.asarray(adjoint @ covariance @ adjoint.T)
 
 
 def similarity_adjoint(T_first_cam: Array) -> Array:

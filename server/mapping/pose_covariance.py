@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.geometry import invert_transform
-from semcast.server.mapping.guessed_place import similarity_adjoint
+from semcast.server.mapping.guessed_place import carried
 from semcast.server.mapping.world_map import WorldMap
 
 Array = NDArray[np.float64]
@@ -30,8 +30,7 @@ def pose_covariance(
     found = covariance_in_map
     for keyframe in reversed(world.keyframes):
         if keyframe.submap == submap and (drift := world.drift.of(keyframe.frame_id)) is not None:
-            carried = similarity_adjoint(invert_transform(keyframe.T_world_cam) @ T_world_cam)
-            found = found + (carried @ drift @ carried.T)[:6, :6]
+            found = found + carried(drift, invert_transform(keyframe.T_world_cam) @ T_world_cam)[:6, :6]
             break
     if (guess := world.guesses.get(submap)) is None:
         return found

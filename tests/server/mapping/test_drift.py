@@ -174,29 +174,28 @@ def test_a_map_that_closes_a_loop_is_known_there_as_its_place_is(builder, monkey
     np.testing.assert_allclose(at_end, 1e-9 * np.eye(6) + 11 * of_window()[:6, :6])
 
 
-def test_a_part_that_is_joined_is_off_by_what_its_place_is_and_in_the_unit_there(builder, monkeypatch):
+def join(builder, monkeypatch, submap, keyframe_id):
+    """Recognise a keyframe of the other part, whose unit is twice as large; the factor on the current one."""
     monkeypatch.setattr(map_builder, "submap_similarity", lambda *_: (2.0, np.eye(4)))
     monkeypatch.setattr(map_builder, "may_join", lambda *_, **__: True)
-    builder.enter(1)
-    place = SimpleNamespace(submap=0, keyframe_id=20)
+    builder.enter(1 - submap)
+    place = SimpleNamespace(submap=submap, keyframe_id=keyframe_id)
     tracks = SimpleNamespace(visible=np.ones(0, bool), ids=np.zeros(0, np.int64), xy=np.zeros((0, 2)))
-    assert builder.join(place, pose(0), tracks) == 2.0
+    return builder.join(place, pose(0), tracks)
+
+
+def test_a_part_that_is_joined_is_off_by_what_its_place_is_and_in_the_unit_there(builder, monkeypatch):
+    assert join(builder, monkeypatch, 0, 20) == 2.0
     own = 11 * of_window(place=2 * 0.02)
     np.testing.assert_allclose(builder.world.drift.of(110), own + 21 * of_window(), atol=1e-12)
     np.testing.assert_allclose(builder.world.drift.of(10), 11 * of_window())
 
 
-def test_an_older_part_that_the_camera_is_in_stays_and_its_newest_keyframe_is_behind_the_other(
+def test_an_older_part_that_the_camera_is_in_stays_and_the_other_is_behind_its_newest_keyframe(
     builder, monkeypatch
 ):
-    monkeypatch.setattr(map_builder, "submap_similarity", lambda *_: (2.0, np.eye(4)))
-    monkeypatch.setattr(map_builder, "may_join", lambda *_, **__: True)
-    builder.enter(0)
-    place = SimpleNamespace(submap=1, keyframe_id=120)
-    tracks = SimpleNamespace(visible=np.ones(0, bool), ids=np.zeros(0, np.int64), xy=np.zeros((0, 2)))
-    assert builder.join(place, pose(0), tracks) == 1.0
+    assert join(builder, monkeypatch, 1, 120) == 1.0
     # Keyframe 40 is at 4, and so is 140 at half the scale: at 2.
-    carried = similarity_adjoint(pose(-2))
-    own = 41 * of_window(place=0.5 * 0.02)
-    np.testing.assert_allclose(builder.world.drift.of(140), own + 41 * carried @ of_window() @ carried.T)
+    own, moved = 41 * of_window(place=0.5 * 0.02), similarity_adjoint(pose(-2))
+    np.testing.assert_allclose(builder.world.drift.of(140), own + 41 * moved @ of_window() @ moved.T)
     np.testing.assert_allclose(builder.world.drift.of(40), 41 * of_window())
