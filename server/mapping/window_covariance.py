@@ -64,7 +64,7 @@ def window_covariance(window: Window, state: State, *, sets_unit: bool = False) 
         moves = _moves_without_each(window, state, slopes, system, scaled, scaled_right)
     except np.linalg.LinAlgError:
         return None
-    ends, own_variance = _ends(window, seen, factor, scaled)
+    ends, own_variance = _ends(window, seen, factor, scaled, sets_unit=sets_unit)
     spread = inverse
     if len(moves) >= _MIN_GROUPS:
         spread = (1.0 - 1.0 / len(moves)) * moves.T @ moves
@@ -144,39 +144,49 @@ def _moves_without_each(
     return np.asarray(np.linalg.solve(system - _LEFT_OUT * parts, pulls[..., None])[..., 0])
 
 
-def _ends(window: Window, seen: Seen, factor: Array, scaled: Array) -> tuple[Array, Array]:
+def _ends(
+    window: Window, seen: Seen, factor: Array, scaled: Array, *, sets_unit: bool
+) -> tuple[Array, Array]:
     """What is asked of each free view: its twist, and the scale of what it sees.
 
-    That is the mean of the logarithms of depths, those that are known best counting most: a turn or a step of
-    the camera changes them, and so do the landmarks, with the poses and by their own errors.
+    That is the mean of the logarithms of depths, those that are known best counting most, less that of what
+    the held views see: a turn or a step of the camera changes it, and so do the landmarks, with the poses and
+    by their own errors. What both see cancels: a view that sees what the one before saw has its scale, and a
+    scale drifts only as fast as other landmarks take their place.
 
     Args:
         window: What was adjusted.
         seen: As seen there.
         factor: ``(P, 3, 3)``, see ``Normal.reduced``.
         scaled: ``(3 P, C)``, see there.
+        sets_unit: See ``window_covariance``; the slopes are those of the whole mean then.
 
     Returns:
         Slopes ``(V, 7, C)`` by the poses' twists; and the variance ``(V,)`` that the landmarks' own errors
         add to the scale's.
     """
-    num_views, count = int(window.free.sum()), window.num_unknowns
-    front = seen.points_cam[2].take(window.of_free) > 0.0
-    rows = window.of_free[front]
-    view, point = window.first_unknown[window.view[rows]] // 6, window.point[rows]
+    num_views, free = len(window.free), window.free
+    num_free = int(free.sum())
+    rows = np.flatnonzero(seen.points_cam[2] > 0.0)
+    view, point = window.view[rows], window.point[rows]
     x, y, z = seen.points_cam.take(rows, axis=1)
     by_point = np.einsum("mij,jm->mi", factor[point], seen.R_cam_world[2].take(rows, axis=1) / z)
     information = 1.0 / np.square(by_point).sum(axis=1)
-    share = information / np.maximum(summed(view, information, num_views), 1e-300)[view]
+    known = summed(view, information, num_views)
+    share = information / np.maximum(known, 1e-300)[view]
     by_landmarks = np.zeros((num_views, window.num_points, 3))
     by_landmarks[view, point] = share[:, None] * by_point
     landmarks = by_landmarks.reshape(num_views, -1)
-    ends = np.zeros((num_views, 7, count))
-    ends[:, 6] = -landmarks @ scaled
-    for k in range(num_views):
+    others = np.where(free, 1.0, 0.0) if sets_unit else np.where(free, 0.0, known)
+    relative = landmarks[free] - others / max(float(others.sum()), 1e-300) @ landmarks
+    ends = np.zeros((num_free, 7, window.num_unknowns))
+    ends[:, 6] = -(landmarks[free] if sets_unit else relative) @ scaled
+    for k in range(num_free):
         ends[k, :6, 6 * k : 6 * k + 6] = np.eye(6)
+    of_free = free[view]
+    row = window.first_unknown[view[of_free]] // 6
     for axis, slope in ((0, -y / z), (1, x / z), (5, -1.0 / z)):
-        ends[np.arange(num_views), 6, 6 * np.arange(num_views) + axis] += summed(
-            view, share * slope, num_views
+        ends[np.arange(num_free), 6, 6 * np.arange(num_free) + axis] += summed(
+            row, (share * slope)[of_free], num_free
         )
-    return ends, np.square(landmarks).sum(axis=1)
+    return ends, np.square(relative).sum(axis=1)

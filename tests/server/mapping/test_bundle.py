@@ -171,7 +171,7 @@ def test_covariances_are_those_of_the_poses(solver):
     assert np.allclose(ratio, 4.0, rtol=0.1)
     assert optimise(make_problem(with_covariance=False, solver=solver)[0]).covariances is None
     start = optimise(make_problem(noise_px=0.2, solver=solver, sets_unit=True)[0])
-    assert start.covariances[-1, 6, 6] < 0.5 * tight.covariances[-1, 6, 6]
+    assert start.covariances[-1, 6, 6] < 0.7 * tight.covariances[-1, 6, 6]
 
 
 def test_a_point_behind_a_camera_is_left_out():
