@@ -33,7 +33,8 @@ MIN_BELIEVED_SHARE = 0.25
 _BELIEVED_AFTER_GAP = (30, 0.5)
 #: Number and share of rays that must agree for them to steady a pose.
 _STEADY = (10, 0.5)
-#: Share of the inlier landmarks of a pose that must still agree once rays have steadied it.
+#: Share of the inlier landmarks of a pose that must still agree once rays have steadied it: rays may have
+#: slid together, along a skirting board or a shadow, and where landmarks are few they would outvote them.
 _MIN_KEPT_SHARE = 0.8
 #: Landmark errors are cut off here, in standard deviations, when the costs of two poses are compared.
 _CUT_SIGMAS = 3.0
@@ -43,7 +44,7 @@ _MOST_TAKEN = 12.0
 #: of something that moves by itself.
 _MOST_TAKEN_EACH = 0.2
 #: Landmarks leave a turn in doubt where its standard deviation is more pixels than this. They lie together
-#: then, so their own errors are alike: rays may contradict them by as much as they gain, while most agree.
+#: then, so their own errors are alike: rays may contradict them by as much as they gain.
 _TURN_IN_DOUBT_PX = 1.0
 #: Steps by which rays steady a pose that landmarks are sure of, and one that they are not.
 _FEW_STEPS, _MOST_STEPS = 6, 10
@@ -264,13 +265,13 @@ def _steadied(
         rays: Those that have none.
         before: The landmarks' own pose.
         T_world_guess: Expected pose or None.
-        enough: Landmarks that must agree, in doubt; else it is most of those that agreed before as well.
+        enough: Landmarks that must agree, beside most of those that agreed before.
 
     Returns:
         The pose with the landmarks it agrees with; None where rays fit none that landmarks bear out.
     """
     is_in_doubt = _turn_is_in_doubt(before, camera)
-    kept = enough if is_in_doubt else max(enough, _MIN_KEPT_SHARE * before.num_inliers)
+    kept = max(enough, _MIN_KEPT_SHARE * before.num_inliers)
     starts = [before.T_cam_world]
     if is_in_doubt and T_world_guess is not None:
         starts.append(invert_transform(T_world_guess))

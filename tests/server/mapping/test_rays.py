@@ -179,6 +179,27 @@ def test_landmarks_that_lie_together_leave_the_turn_to_the_other_tracks(monkeypa
     assert min(without) > 5.0, "otherwise this shows nothing"
 
 
+def test_tracks_that_slid_together_do_not_overrule_landmarks_that_lie_together():
+    """Few landmarks leave the turn in doubt; what slid along an edge elsewhere is sure of a wrong one."""
+    turned = make_transform(exp_so3(np.array([0.02, -0.2, 0.01])), [0.8, 0.05, 0.1])
+    errors = []
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        world, xyz = scene(0, seed)
+        xy, patch, corner = world.keyframes[-1].xy, slice(0, 26), slice(26, 58)
+        xy[patch], xy[corner] = rng.uniform((300, 200), (340, 260), (26, 2)), (500, 380)
+        xy[corner] += rng.uniform(0, (100, 80), (32, 2))
+        xyz[patch] = CAMERA.unproject(xy[patch]) * rng.uniform(3.9, 4.1, (26, 1))
+        xyz[corner] = CAMERA.unproject(xy[corner]) * 5.0
+        world.add_landmarks(np.arange(26), xyz[patch], np.zeros((26, 3), np.uint8), np.ones(26), 0, 0)
+        seen_xy = project(xyz, turned)[:58] + 0.5 * rng.standard_normal((58, 2))
+        seen_xy[corner] += (0, 35)
+        pose = track(world, np.arange(58), seen_xy, turned)
+        off = log_so3(pose.T_world_cam[:3, :3].T @ turned[:3, :3])
+        errors.append(np.degrees(np.linalg.norm(off)))
+    assert np.median(errors) < 2.0
+
+
 def test_tracks_carry_the_pose_on_where_landmarks_all_but_run_out():
     world, xyz = scene(20)
     xy = project(xyz, MOVED)
