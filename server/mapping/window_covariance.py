@@ -48,8 +48,8 @@ def window_covariance(window: Window, state: State, *, sets_unit: bool = False) 
 
     Returns:
         ``(K, 7, 7)`` covariances of a similarity in each camera's frame: turn in radians, place in map units,
-        logarithm of the scale of what it sees; zero for views that are held. None where the last view is
-        held, or nothing fixes the window.
+        logarithm of the scale of what it sees, against what those that are held see; zero for these. None
+        where the last view is held, or nothing fixes the window.
     """
     if not window.free[-1]:
         return None
