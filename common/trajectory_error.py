@@ -101,12 +101,12 @@ def ate(estimate: Trajectory, truth: Trajectory) -> AteResult | None:
         truth: Reference poses.
 
     Returns:
-        None where the error has no meaning: fewer than ``MIN_MATCHES`` matched poses, a true camera
-        that never moves, or an estimate that never moves.
+        None where the error has no meaning: fewer than ``MIN_MATCHES`` matched poses, or a camera that
+        moves from none of them to another, by the truth or by the estimate.
     """
     estimate_idx, truth_idx = match_times(estimate.t_s, truth.t_s)
     p_map, p_truth = estimate.positions[estimate_idx], truth.positions[truth_idx]
-    if len(p_map) < MIN_MATCHES or truth.path_length == 0.0 or not _has_extent(p_map):
+    if len(p_map) < MIN_MATCHES or not (_has_extent(p_map) and _has_extent(p_truth)):
         return None
     scale, R, t = align_umeyama(p_map, p_truth)
     error = np.linalg.norm(scale * p_map @ R.T + t - p_truth, axis=1)

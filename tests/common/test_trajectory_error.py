@@ -145,6 +145,13 @@ def test_a_truth_that_stands_still_gives_no_percentage():
     assert ate(line(np.arange(5.0)), line(np.zeros(5))) is None
 
 
+def test_a_path_of_which_only_a_rest_was_found_has_no_error_figure():
+    truth = line([2.0, 2.0, 2.0, 2.0, 3.0, 4.0])  # any estimate shrinks to fit that
+    estimate = Trajectory(truth.t_s[:4], line([0.0, 0.3, -0.2, 0.1]).T_world_cam)
+    assert ate(estimate, truth) is None
+    assert trajectory_summary(estimate, truth, num_frames=6)["ate_percent"] is None
+
+
 def test_an_unmatched_clock_gives_no_error_figure():
     truth = line(np.arange(5.0))
     shifted = Trajectory(truth.t_s + 1000.0, truth.T_world_cam)

@@ -59,6 +59,14 @@ def test_poses_without_a_covariance_are_left_out():
     assert stated_ratios(with_one_more, TIMES_NS, truth) == expected
 
 
+def test_of_poses_of_a_camera_at_rest_no_error_is_told():
+    truth = straight_path()
+    truth.T_world_cam[:100, :3, 3] = truth.T_world_cam[100, :3, 3]
+    poses = {k: pose for k, pose in published(truth).items() if k < 100}
+    figures = live_figures(poses, TIMES_NS, truth, NUM)
+    assert figures["ate_at_once_percent"] is figures["stated_ratio_trans"] is None
+
+
 def test_without_truth_or_covariances_nothing_is_said():
     truth = straight_path()
     poses = {k: LivePose(pose.T_world_cam, None) for k, pose in published(truth).items()}
