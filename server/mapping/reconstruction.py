@@ -392,8 +392,9 @@ class Reconstruction:
         ids = self._tracks.ids[visible]
         agrees = np.isin(ids, [] if pose is None else pose.ids[pose.inliers], assume_unique=True)
         covariance = None
-        if pose is not None and frame.frame_id in self._map.world.frames:
-            covariance = self._map.pose_covariance(pose.covariance, pose.T_world_cam)
+        if pose is not None and T_world_cam is not None and frame.frame_id in self._map.world.frames:
+            # Not of where ``pose`` has it: a join may have moved the map since.
+            covariance = self._map.pose_covariance(pose.covariance, T_world_cam)
         return FrameResult(
             frame_id=frame.frame_id,
             t_source_ns=frame.t_source_ns,

@@ -139,12 +139,16 @@ def test_a_new_part_is_placed_by_the_old_one_as_its_last_adjustment_leaves_it():
 
 
 def test_a_new_map_joins_the_old_one_when_it_comes_into_view(caplog, monkeypatch):
-    scales, covariances, results = [], [], []
+    scales, covariances, asked_at, results = [], [], [], []
     join, carried_over = MapBuilder.join, MapBuilder.pose_covariance
+
+    def noted(builder, covariance, T_world_cam):
+        covariances.append(covariance)
+        asked_at.append(T_world_cam)
+        return carried_over(builder, covariance, T_world_cam)
+
     monkeypatch.setattr(MapBuilder, "join", lambda *a: scales.append(join(*a)) or scales[-1])
-    monkeypatch.setattr(
-        MapBuilder, "pose_covariance", lambda *a: covariances.append(a[1]) or carried_over(*a)
-    )
+    monkeypatch.setattr(MapBuilder, "pose_covariance", noted)
     # The camera jumps out of view of all it knows, begins a new map, and goes back.
     x = [0.12 * k for k in range(8)] + [13.0 - 0.3 * k for k in range(42)]
     truth = [make_transform(np.eye(3), (v, 0.05 * np.sin(v), 0.0)) for v in x]
@@ -158,6 +162,8 @@ def test_a_new_map_joins_the_old_one_when_it_comes_into_view(caplog, monkeypatch
                 assert abs(np.log(scales[0])) > 0.5
                 assert np.allclose(np.diag(after)[:3], np.diag(before)[:3], rtol=0.3)
                 assert np.allclose(np.diag(after)[3:], scales[0] ** 2 * np.diag(before)[3:], rtol=0.3)
+                assert np.linalg.norm(asked_at[-1][:3, 3] - asked_at[-2][:3, 3]) > 1.0, "it was moved"
+                assert np.array_equal(asked_at[-1], results[-1].T_world_cam), "what is told is of that pose"
                 scales.append(None)
     assert "a new map is begun" in caplog.text
     assert "submaps are joined" in caplog.text
