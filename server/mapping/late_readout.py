@@ -34,7 +34,6 @@ def put_map_right(
         flows: How images moved, by frame id; frames without are left as they are.
     """
     poses = _upright(world, camera, flows)
-    hang_on = {frame_id: world.frames[frame_id][0] for frame_id in poses}
     rows = RowTimes(camera)
     greys = {image.frame_id: image.grey for image in images}
     for keyframe in world.keyframes:
@@ -47,8 +46,8 @@ def put_map_right(
             images.replace(SeenFrom(frame_id, right))
         if frame_id in poses:
             world.move_keyframe(frame_id, poses[frame_id])
-    for frame_id, keyframe_id in hang_on.items():
-        world.add_frame(frame_id, keyframe_id, poses[frame_id])
+    for frame_id, T_world_cam in poses.items():
+        world.move_frame(frame_id, T_world_cam)
 
 
 def _upright(world: WorldMap, camera: Intrinsics, flows: Mapping[int, ImageFlow]) -> dict[int, Array]:

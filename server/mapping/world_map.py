@@ -192,6 +192,15 @@ class WorldMap:
         """
         self.frames[frame_id] = (keyframe_id, invert_transform(self.poses[keyframe_id]) @ T_world_cam)
 
+    def move_frame(self, frame_id: int, T_world_cam: Array) -> None:
+        """Set the pose of a frame that has one; it goes on to move with the same keyframe.
+
+        Raises:
+            KeyError: It has none.
+        """
+        self.add_frame(frame_id, self.frames[frame_id][0], T_world_cam)
+        self._frames_moved.add(frame_id)
+
     def forget_frames(self, frame_ids: Collection[int]) -> None:
         """Take the pose from frames; keyframes among them stay for what they see."""
         self._withdrawn.update(frame_ids)

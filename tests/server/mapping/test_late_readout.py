@@ -108,6 +108,22 @@ def test_keyframes_are_put_right_by_what_they_have_in_view(rng):
     np.testing.assert_array_equal(third.xy[:30], camera.project(in_view))
 
 
+def test_frames_that_are_put_right_are_told_as_moved(rng):
+    camera = replace(CAMERA, readout_ms=25.0)
+    flows = {k: ImageFlow(camera, np.array([0.1 * k, 0, 0, 0, 0, 0, 0, 0])) for k in (1, 2)}
+    xyz = camera.unproject(rng.uniform(0, (camera.width, camera.height), (30, 2))) * 3.0
+    world, ids = WorldMap(), np.arange(30)
+    world.add_keyframe(Keyframe(0, 0, np.eye(4), 0, ids, camera.project(xyz), np.ones(30)))
+    world.add_landmarks(ids, xyz, np.zeros((30, 3), np.uint8), np.ones(30), 0, 0)
+    for frame_id in (1, 2, 3):
+        world.add_frame(frame_id, 0, np.eye(4))
+    world.take_changes()
+    put_map_right(world, KeyframeImages(3), camera, flows)
+    assert world.frames[1][0] == 0, "it moves with the same keyframe"
+    assert all(np.abs(world.pose_of_frame(k) - np.eye(4)).max() > 1e-4 for k in flows)
+    assert world.take_changes().frames.tolist() == [1, 2]
+
+
 def test_what_was_found_outlives_a_restart_and_a_reset():
     reconstruction, _, _ = run(READOUT_S, 0)
     found = reconstruction.camera
