@@ -120,7 +120,8 @@ def _motion(T_first_cam: Array, begin: NDArray[np.int64], end: NDArray[np.int64]
 def _gaps_in(t_s: Array, span_s: float, later_s: float) -> tuple[NDArray[np.int64], ...]:
     """Rows of times ``(N,)`` at which gaps begin and end, and up to which is known what came after."""
     now = np.arange(1, len(t_s))
-    after = np.searchsorted(t_s, t_s[now] + span_s - SAME_S)
+    # One step at least: two images may have as good as one time.
+    after = np.maximum(np.searchsorted(t_s, t_s[now] + span_s - SAME_S), now + 1)
     now, after = now[after + 1 < len(t_s)], after[after + 1 < len(t_s)]
     later = np.maximum(last_by(t_s, t_s[after] + later_s), after + 1)
     taken = slice(None, None, max(1, -(-len(now) // _MAX_TRIED)))

@@ -82,3 +82,11 @@ def test_a_standing_clock_tells_nothing():
     for _ in range(9):
         motion.observe(0, np.eye(4))
     assert motion.bridge_variances(1_000_000_000, 0.5) is None
+
+
+@pytest.mark.parametrize("gap_ns", [1, 500, 1000])
+def test_of_as_good_as_no_gap_next_to_no_error_is_told(rng, gap_ns):
+    # A video with one stamp far ahead has times a nanosecond apart until the others have caught up.
+    motion = seen(wandering(rng, 30))
+    for variance in motion.bridge_variances(round(29 * FRAME_S * 1e9) + gap_ns, 0.5):
+        assert 0.0 < variance < 1e-12
