@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from semcast.common.geometry import exp_so3, invert_transform, log_so3, make_transform
 from semcast.server.geometry.gap_bridge import cross_gap, even_turns, hindcast, way_of
-from semcast.server.geometry.whereabouts import Step, Whereabouts, last_by, mean_way
+from semcast.server.geometry.whereabouts import SAME_S, Step, Whereabouts, last_by, mean_way
 
 Array = NDArray[np.float64]
 
@@ -82,12 +82,13 @@ class ConstantVelocity:
     def observe(self, t_source_ns: int, T_world_cam: Array) -> None:
         """Take the pose of a frame, in the map's unit.
 
-        A frame not after the one before, or too long after it, tells no motion: the camera then rests.
+        A frame not after the one before, but for rounding, or too long after it, tells no motion: the camera
+        then rests.
         """
         if self._last is not None:
             t_ns, T_world_before = self._last
             elapsed_s = (t_source_ns - t_ns) * 1e-9
-            if 0.0 < elapsed_s <= MAX_EXTRAPOLATION_S:
+            if SAME_S < elapsed_s <= MAX_EXTRAPOLATION_S:
                 T_before_now = invert_transform(T_world_before) @ T_world_cam
                 turn = log_so3(T_before_now[:3, :3])
                 self._rotation_rad_per_s = turn / elapsed_s

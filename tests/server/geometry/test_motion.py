@@ -145,6 +145,15 @@ def test_a_gap_that_is_too_long_is_not_bridged():
     assert motion.bridge(32 * FRAME_NS, STEP, 0.1) is None
 
 
+def test_images_of_as_good_as_one_time_tell_no_motion():
+    # A video with one stamp far ahead has times a nanosecond apart until the others have caught up.
+    motion = ConstantVelocity()
+    for k in range(5):
+        motion.observe(k, make_transform(np.eye(3), (0.1 * k, 0.0, 0.0)))
+    np.testing.assert_allclose(motion.predict(100_000_000)[:3, 3], (0.4, 0.0, 0.0))
+    assert motion.speed_map_per_s == 0.0
+
+
 def test_extrapolation_ends():
     motion = ConstantVelocity()
     motion.observe(0, np.eye(4))

@@ -15,7 +15,7 @@ from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.bundle_process import ProcessBundle
 from semcast.server.mapping.reconstruction import Reconstruction
 from semcast.server.mapping.settings import ReconstructionSettings
-from semcast.server.mapping.state import TrackingState
+from semcast.server.mapping.state import DecodedFrame, TrackingState
 
 
 def run(images, reconstruction, ids=None):
@@ -157,6 +157,16 @@ def test_missing_and_late_frames_are_expected(room):
     trajectory = reconstruction.final_trajectory()
     assert sorted(trajectory) == sorted(set(order) - {3})
     assert ate_percent(trajectory, poses) < 1.5
+
+
+def test_times_that_hardly_go_on_cost_no_pose(room):
+    poses, images = room
+    reconstruction = make()
+    for k, image in enumerate(images):  # two images each time, a nanosecond apart
+        reconstruction.process(DecodedFrame(k, k // 2 * 200_000_000 + k % 2, image))
+    trajectory = reconstruction.final_trajectory()
+    assert sorted(trajectory) == list(range(len(images)))
+    assert ate_percent(trajectory, poses) < 1.0
 
 
 def test_standing_still_waits_and_then_starts(room):
