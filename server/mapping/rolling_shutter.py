@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.server.geometry.features import to_grey
 from semcast.server.geometry.finite_differences import slope_weights
+from semcast.server.geometry.whereabouts import SAME_S
 from semcast.server.mapping.readout import Readout
 from semcast.server.mapping.sight import Sight, usable_rows
 from semcast.server.mapping.state import DecodedFrame
@@ -196,7 +197,7 @@ class RollingShutter:
 
     def see(self, frame: DecodedFrame) -> Sight:
         """Return an image put right by the movement before it, for tracks to be followed in."""
-        if not 0.0 < self._since_s(frame) < _MAX_STEP_S:
+        if not SAME_S < self._since_s(frame) < _MAX_STEP_S:
             self._flow = None
             self._steps.clear()
         return self._sight(frame, with_colours=False)
@@ -270,7 +271,7 @@ class RollingShutter:
 
     def _measured(self, step_s: float, xy: Array, way: Array) -> ImageFlow | None:
         mean = None
-        if 0.0 < step_s < _MAX_STEP_S:
+        if SAME_S < step_s < _MAX_STEP_S:
             mean = ImageFlow.fitted(self.camera, xy - 0.5 * way, way / step_s)
         if mean is None:
             self._steps.clear()

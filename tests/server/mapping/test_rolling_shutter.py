@@ -175,6 +175,21 @@ def test_without_enough_points_or_after_a_gap_nothing_is_assumed():
     assert not is_first
 
 
+def test_images_of_as_good_as_one_time_tell_no_movement():
+    shutter, tracks, t_ns = shutter_of(READOUT_MS), TrackTable("robust", 200, 0), 0
+    for frame_id in range(4):
+        frame = seen((300.0, 0.0), frame_id)
+        if frame_id == 3:
+            frame = replace(frame, t_source_ns=t_ns + 1)
+        t_ns = frame.t_source_ns
+        sight = shutter.see(frame)
+        tracks.follow(sight, tracks.xy + tracks.velocity) if len(tracks) else tracks.remember(sight)
+        sight, _ = shutter.settle(frame, sight, tracks)
+        tracks.refill(sight)
+    assert sight.frame is frame, "as received"
+    assert set(shutter.flows) == {0, 1, 2}
+
+
 @pytest.mark.parametrize("num_missed", [0, 1])
 def test_the_first_image_moved_as_the_two_after_it_tell_and_no_later_ones(num_missed):
     shutter, tracks = shutter_of(READOUT_MS), TrackTable("robust", 200, 0)
