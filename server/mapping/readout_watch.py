@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import MAX_READOUT_MS, Intrinsics
+from semcast.server.geometry.whereabouts import SAME_S
 from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult, ViewMotion
 from semcast.server.mapping.lens_doubt import lens_doubt
 from semcast.server.mapping.readout import Axis, Readout, body_velocity, fit_readout
@@ -98,7 +99,7 @@ class ReadoutWatch:
                 break
             frame_id, t_ns = self._frames[k]
             T_world_cam = world.pose_of_frame(frame_id)
-            if T_world_cam is None or not 0 < way * (t_ns - last_ns) <= _MAX_STEP_S * 1e9:
+            if T_world_cam is None or not SAME_S * 1e9 < way * (t_ns - last_ns) <= _MAX_STEP_S * 1e9:
                 break
             found.append(((t_ns - at_ns) * 1e-9, T_world_cam))
             last_ns = t_ns

@@ -218,3 +218,17 @@ def test_the_velocity_of_a_shaking_hand_is_found_by_frames_to_either_side():
     truth_rad_s = 0.02 * w_rad_s * np.cos(w_rad_s * keyframe_ids / rate_hz)
     error_rad_s = np.abs(found_rad_s - truth_rad_s)[known]
     assert np.median(error_rad_s) < 0.01 * 0.02 * w_rad_s
+
+
+def test_frames_of_as_good_as_one_time_tell_no_velocity():
+    # A video with one stamp far ahead, of frame 20, has times a nanosecond apart until the others catch up.
+    watch, t_ns = ReadoutWatch(CAMERA, is_wanted=True), -1
+    for frame_id in range(40):
+        t_ns = max(t_ns + 1, 33_000_000 * (frame_id + (5 if frame_id == 20 else 0)))
+        watch.note(frame_id, t_ns)
+    world = SimpleNamespace(pose_of_frame=lambda frame_id: exp_se3(np.full(6, 0.01 * frame_id)))
+    keyframe_ids = np.arange(0, 40, 3)
+    velocity = watch.motion(world, SimpleNamespace(keyframe_ids=keyframe_ids)).velocity
+    known = np.isfinite(velocity).all(axis=1)
+    assert keyframe_ids[~known].tolist() == [0, 21, 24, 39]
+    assert np.abs(velocity[known]).max() < 1.0
