@@ -154,7 +154,9 @@ def replay(
         ConfigError: The folder for outputs can't be used, or another run is writing into it.
         CheckpointError: The recorded stream was encoded with other weights than those installed.
     """
-    settings = replace(settings, reconstruction=replace(settings.reconstruction, seed=settings.seed))
+    seeded = replace(settings.reconstruction, seed=settings.seed)
+    # What is kept of them names the symbols: those that went through no channel here have a link there, too.
+    settings = replace(settings, symbols=settings.source, reconstruction=seeded)
     reader = RecordingReader(settings.file)
     stream = choose_stream(reader, settings.stream, settings.source)
     server = ServerSettings(

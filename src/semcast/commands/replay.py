@@ -10,6 +10,7 @@ from rich.text import Text
 from semcast.commands.console import plain_console
 from semcast.commands.demo import summary_table, why_no_pose
 from semcast.commands.running import add_settings, read_given, read_settings, run_until_stopped
+from semcast.common.config_flags import given_values
 from semcast.common.run_folder import files_of_run
 from semcast.server.replay import ReplaySettings, replay
 
@@ -22,11 +23,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_settings(parser, ReplaySettings, _UNUSED)
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Replay and print the figures."""
+def settings_of(arguments: argparse.Namespace) -> ReplaySettings:
+    """Return the settings that were given; a channel that is asked for takes what the agent sent.
+
+    Also one asked for by its default values, and by flags beside a file of a replay as received.
+    """
+    typed = given_values(ReplaySettings, arguments, skip=_UNUSED)
+    if "link" in typed and "symbols" not in typed:
+        arguments.symbols = "transmitted"
     settings = read_settings(ReplaySettings, arguments)
     if settings.symbols is None and "link" in read_given(ReplaySettings, arguments):
-        settings = replace(settings, symbols="transmitted")  # a channel asked for by its default values
+        return replace(settings, symbols="transmitted")
+    return settings
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Replay and print the figures."""
+    settings = settings_of(arguments)
     talk = plain_console(stderr=True)
     summary: dict[str, Any] = {}
 
