@@ -18,7 +18,7 @@ from semcast.cli import main
 from semcast.commands.demo import few_poses, summary_table, why_no_pose
 from semcast.common.camera import Intrinsics
 from semcast.common.camera_settings import CameraSettings
-from semcast.common.config import build_settings, read_toml
+from semcast.common.config import build_settings, read_toml, to_toml
 from semcast.common.errors import ConfigError, SemcastError, SourceError
 from semcast.common.loopback import free_endpoint
 from semcast.common.recording_reader import RecordingReader
@@ -437,3 +437,18 @@ def test_frames_that_a_busy_machine_skipped_are_not_blamed_on_the_images():
     assert f"no frame has a pose: {told}" in why_no_pose({"completeness": 0.0, **skipped})
     few = {**skipped, "drops": {"superseded": 10}}
     assert "are the images" in few_poses({"completeness": 0.059, **few})
+
+
+@pytest.mark.parametrize(
+    ("link", "words", "told"),
+    [
+        ({}, [], []),  # as a demo leaves it in its demo.toml
+        ({"slot_loss": 0.3}, [], ["slot_loss: no effect on channel awgn as it is set"]),
+        ({}, ["--slot-loss", "0.2"], ["slot_loss: no effect on channel awgn as it is set"]),
+    ],
+)
+def test_values_of_a_link_that_nobody_asked_for_are_not_warned_of(link, words, told, tmp_path, caplog):
+    file = tmp_path / "demo.toml"
+    file.write_text(to_toml(DemoSettings(sequence=tmp_path / "none", link=ChannelSettings(**link))))
+    assert main(["demo", "--config", str(file), *words]) == 1
+    assert [record.message for record in caplog.records if "no effect" in record.message] == told

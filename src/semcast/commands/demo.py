@@ -5,15 +5,17 @@ import json
 import shlex
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from semcast.channel.emulator import warn_of_settings
+from semcast.channel.settings import ChannelSettings
 from semcast.commands.console import plain_console
-from semcast.commands.running import INTERRUPTED, add_settings, read_given, read_settings, run_until_stopped
+from semcast.commands.running import INTERRUPTED, add_settings, read_settings, run_until_stopped
+from semcast.common.config_flags import given_values
 from semcast.common.metrics import DUPLICATE
 from semcast.common.run_folder import FRAMES_NAME, VIEWER_NAME, files_of_run
 from semcast.demo import DemoSettings, open_recording, run_demo
@@ -91,13 +93,20 @@ def few_poses(summary: Mapping[str, Any]) -> str | None:
     )
 
 
+def _asked_of_link(settings: DemoSettings, arguments: argparse.Namespace) -> set[str]:
+    """Return the names of those values of the link that somebody asked for: a demo.toml holds them all."""
+    typed = given_values(DemoSettings, arguments).get("link", {})
+    link, usual = asdict(settings.link), asdict(ChannelSettings())
+    return {*typed, *(name for name in link if link[name] != usual[name])}
+
+
 def run(arguments: argparse.Namespace) -> int:
     """Run the demo; exit code 1 when no frame got a pose.
 
     With ``--json -`` the summary has stdout for itself.
     """
     settings = read_settings(DemoSettings, arguments)
-    warn_of_settings(settings.link, read_given(DemoSettings, arguments).get("link", {}))
+    warn_of_settings(settings.link, _asked_of_link(settings, arguments))
     json_to_stdout = settings.json == STDOUT
     if json_to_stdout:
         settings = replace(settings, json=None)
