@@ -207,6 +207,18 @@ def test_a_folder_of_photos_says_what_is_missing(tmp_path):
     assert "intrinsics.json" in text
 
 
+def test_what_is_wrong_with_a_sequence_is_said_once(tmp_path, caplog):
+    write_images(tmp_path / "images", 5)
+    (tmp_path / "groundtruth.txt").write_text("1000 0 0 0 0 0 0 1\n1001 0 0 1 0 0 0 1\n")
+    assert "true path: none" in text_of(tmp_path)
+    assert caplog.text.count("none of its 2 true poses") == 1
+    (tmp_path / "groundtruth.txt").unlink()
+    (tmp_path / "sparse" / "0").mkdir(parents=True)
+    (tmp_path / "sparse" / "0" / "images.txt").write_text("")
+    assert "true path: none" in text_of(tmp_path)
+    assert caplog.text.count("half a model of COLMAP's") == 1
+
+
 def test_times_that_nobody_recorded_are_said_to_be_assumed(tmp_path):
     write_images(tmp_path / "images", 5)
     assert "0.4 s, 10.0 images a second, assumed: no times are recorded" in text_of(tmp_path)

@@ -236,16 +236,17 @@ def _figures(summary: dict[str, Any]) -> list[tuple[str, str]]:
 def describe_sequence(path: Path) -> list[Section]:
     """Say what a recorded image sequence holds; what is missing is said, not an error."""
     from semcast.common.sequence import open_sequence
-    from semcast.common.sequence_layouts import ns_to_seconds
+    from semcast.common.sequence_layouts import find_layout, ns_to_seconds, read_layout
 
-    sequence = open_sequence(path)
+    layout = find_layout(path)
+    sequence = open_sequence(path, layout=layout)
     facts = [("images", f"{len(sequence)}, {sequence.size_wh[0]}x{sequence.size_wh[1]} px")]
     facts += _refused(*sequence.refused_images())
     times_s = ns_to_seconds(sequence.times_ns)
     if len(times_s) > 1:
         rate_hz = (len(times_s) - 1) / (times_s[-1] - times_s[0])
         # Where a folder records no times, they follow the rate it is opened with.
-        is_assumed = (sequence.times_ns != open_sequence(path, rate_hz=2.0 * rate_hz).times_ns).any()
+        is_assumed = (sequence.times_ns != read_layout(path, layout, 2.0 * rate_hz).times_ns).any()
         note = ", assumed: no times are recorded" if is_assumed else ""
         facts.append(("time", f"{times_s[-1] - times_s[0]:.1f} s, {rate_hz:.1f} images a second{note}"))
     try:
