@@ -32,6 +32,7 @@ Pose and structure
     triangulation    points from rays
     projection       world points in a camera, and the derivatives of their pixels
     motion           constant-velocity prior
+    bunches          frames that come in bunches, and whether their times mislead
     gap_bridge       how the camera got across a gap, and how far off that is
     whereabouts      where the camera can have got to in a gap
 

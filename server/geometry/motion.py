@@ -27,9 +27,15 @@ _LEAST_SHARE_OF_SPEED = 0.02
 
 
 class ConstantVelocity:
-    """Predicts the next pose from the last two, scaled by their times."""
+    """Predicts the next pose from the last two, scaled by their times.
+
+    Attributes:
+        times_mislead: Whether frames come in bunches whose times tell nothing of how far the camera went from
+            one to the next: a speed is then that of a second, of turning too.
+    """
 
     def __init__(self) -> None:
+        self.times_mislead = False
         self._last: tuple[int, Array] | None = None
         self._rotation_rad_per_s: Array = np.zeros(3)
         self._translation_per_s: Array = np.zeros(3)
@@ -78,6 +84,12 @@ class ConstantVelocity:
     def _way_per_s(self) -> Array:
         """Mean translation per second in the camera's own frame: turning does not shorten it, noise does."""
         return mean_way(self._steps, _SPEED_S)
+
+    def _turn_per_s(self) -> Array:
+        """Rotation vector per second in the camera's own frame, of the last step unless times mislead."""
+        if not self.times_mislead:
+            return self._rotation_rad_per_s
+        return mean_way([(step_s, T, log_so3(T[:3, :3])) for step_s, T, _ in self._steps], _SPEED_S)
 
     def observe(self, t_source_ns: int, T_world_cam: Array) -> None:
         """Take the pose of a frame, in the map's unit.
@@ -131,7 +143,7 @@ class ConstantVelocity:
 
     def turn_in(self, elapsed_s: float) -> Array:
         """Rotation ``R_now_then (3, 3)`` of a camera that goes on turning as it did for so long."""
-        return exp_so3(elapsed_s * self._rotation_rad_per_s)
+        return exp_so3(elapsed_s * self._turn_per_s())
 
     def whereabouts(self, t_source_ns: int, depth: float) -> Whereabouts | None:
         """Where the camera can be at a time, with the scene at a depth in map units.
@@ -178,7 +190,7 @@ class ConstantVelocity:
             ends = np.array([then_ns - t_ns for then_ns, _ in turned]) * 1e-9 / gap_s
             turns = np.stack([log_so3(before.T @ after) for (_, before), (_, after) in pairwise(turned)])
         else:
-            ends, turns = even_turns(gap, self._rotation_rad_per_s, turn_later / later_s)
+            ends, turns = even_turns(gap, self._turn_per_s(), turn_later / later_s)
         return cross_gap(T_world_cam, gap, (self._way_per_s(), way_later / later_s), ends, turns)
 
     def bridge_variances(self, t_source_ns: int, later_s: float) -> tuple[float, float] | None:

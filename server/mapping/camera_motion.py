@@ -7,12 +7,14 @@ sets off from where it stood, one that went on is where it would have got to by 
 """
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform, transform_points
+from semcast.server.geometry.bunches import Bunches, in_bunches
 from semcast.server.geometry.motion import MAX_EXTRAPOLATION_S, ConstantVelocity
 from semcast.server.geometry.whereabouts import Whereabouts
 
@@ -43,6 +45,8 @@ _REST_NS = 1_000_000_000
 _REST_SHARE = 0.03
 #: A frame comes after a gap if it comes after this many intervals of the frames before it.
 _GAP_INTERVALS = 3.0
+#: Where they come in bunches, and each after a long interval, it is so many of the longest of so many.
+_NUM_INTERVALS = 12
 _S_PER_NS = 1e-9
 
 
@@ -61,6 +65,7 @@ class CameraMotion:
     def reset(self) -> None:
         """Forget the motion."""
         self._motion = ConstantVelocity()
+        self._bunches = Bunches()
         self._moving: tuple[int, Array] | None = None
         self._still: list[int] = []
         self._still_ns = 0
@@ -84,15 +89,33 @@ class CameraMotion:
         """Replace the last pose after the map has moved; the motion in the camera's frame stays."""
         self._motion.correct(T_world_cam, scale)
         if scale != 1.0:
+            self._bunches.rescale(scale)
             self._recent = []  # poses in another unit: whether the camera rests has to show anew
         if self._moving is not None:
             self._moving = (self._moving[0], T_world_cam.copy())
 
     def predict(self, t_source_ns: int) -> Array | None:
         """``T_world_cam`` expected at a time, None without any pose: where the camera stands or got to."""
-        if self._still and self._moving is not None:
+        if self._moving is None:
+            return self._motion.predict(t_source_ns)
+        if self._still:
             return self._moving[1].copy()
-        return self._motion.predict(t_source_ns)
+        return self._one_more_step() if self._bunches.mislead else self._motion.predict(t_source_ns)
+
+    def predict_step(self) -> Array | None:
+        """Where one more step like the last leads, None unless the newest frames came in bunches.
+
+        By their times the camera would stand still in a bunch and be far off at the next, which it may have
+        done or not.
+        """
+        if self._still or not in_bunches(self._intervals_ns()):
+            return None
+        return self._one_more_step()
+
+    def _one_more_step(self) -> Array | None:
+        if self._moving is None or (step := self._bunches.last) is None:
+            return None
+        return np.asarray(self._moving[1] @ step)
 
     def predict_on(self, t_source_ns: int) -> Array | None:
         """Where a camera that seems to have stopped would be if it went on, None where it did not stop."""
@@ -125,14 +148,17 @@ class CameraMotion:
 
         Args:
             t_source_ns: Time of the frame. Much further from the one before than that was from its own, some
-                are missing.
+                are missing; where times mislead, much further than any of late.
         """
-        if len(self._came_ns) == 2:
-            before_ns, last_ns = self._came_ns
+        if intervals_ns := self._intervals_ns():
+            usual_ns = max(intervals_ns) if self._bunches.mislead else intervals_ns[-1]
             # Of a source that gives two images one time, these tell no interval.
-            self._has_gap |= t_source_ns - last_ns > _GAP_INTERVALS * (last_ns - before_ns) > 0.0
-        self._came_ns = [*self._came_ns[-1:], t_source_ns]
+            self._has_gap |= t_source_ns - self._came_ns[-1] > _GAP_INTERVALS * usual_ns > 0.0
+        self._came_ns = [*self._came_ns[-_NUM_INTERVALS:], t_source_ns]
         return self._has_gap
+
+    def _intervals_ns(self) -> list[float]:
+        return [float(after - before) for before, after in pairwise(self._came_ns)]
 
     def observe(
         self, frame_id: int, t_source_ns: int, T_world_cam: Array, xyz: Array, *, stands: bool = False
@@ -166,7 +192,12 @@ class CameraMotion:
         before_ns = self._still_ns if self._still else since_ns
         known_ns = min(t_source_ns - since_ns, round(MAX_EXTRAPOLATION_S / _S_PER_NS))
         steps = known_ns / max(1, t_source_ns - before_ns)
-        if most_px < _STILL_SHARE * most_expected_px / max(1.0, steps):
+        still_px = _STILL_SHARE * most_expected_px / max(1.0, steps)
+        if (T_world_step := self.predict_step()) is not None:
+            # In a bunch, what moves by as much as from the frame before to the last has not stopped.
+            (step,) = self._displacements(T_world_moving, [T_world_step], xyz)
+            still_px = min(still_px, _STILL_SHARE * _lengths(step)[1])
+        if most_px < still_px:
             self._still.append(frame_id)
             self._still_ns = t_source_ns
             return []
@@ -202,6 +233,12 @@ class CameraMotion:
         self._rests = t_source_ns - since_ns >= _REST_NS and len(moved) > 0 and is_near
 
     def _go_on(self, t_source_ns: int, T_world_cam: Array) -> None:
+        if self._moving is not None and not self._still:
+            before_ns, T_world_before = self._moving
+            self._bunches.note(
+                (t_source_ns - before_ns) * _S_PER_NS, invert_transform(T_world_before) @ T_world_cam
+            )
+            self._motion.times_mislead = self._bunches.mislead
         self._motion.observe(t_source_ns, T_world_cam)
         self._moving = (t_source_ns, T_world_cam.copy())
         self._still = []

@@ -132,6 +132,12 @@ class Locator:
             and self._tracks.follow_again(sight, partial(self._expected, T_world_on))
         ):
             pose = self.pose(T_world_on)
+        if (
+            pose is None
+            and (T_world_step := self._motion.predict_step()) is not None
+            and self._tracks.follow_again(sight, partial(self._expected, T_world_step))
+        ):
+            pose = self.pose(T_world_step)
         if pose is None and self._tracks.follow_jump(sight):
             pose = self._possible(self.pose(T_world_guess))
         if pose is None and self._has_gone_astray:

@@ -136,6 +136,63 @@ def test_a_row_of_equal_houses_does_not_hold_the_camera_back_after_a_gap():
     assert ate(trajectory_of(poses, times_ns), sequence.groundtruth()).rmse < 1.0
 
 
+def times_of_bunches(num, size):
+    """Times at which frames come that wait for each other: ``size`` at once, 2 ms apart."""
+    return [(k // size * size + size - 1) * FRAME_NS + k % size * 2_000_000 for k in range(num)]
+
+
+@pytest.mark.parametrize("size", [2, 3, 5])
+def test_a_camera_whose_frames_come_in_bunches_neither_stops_nor_is_gone(size):
+    motion = CameraMotion(CAMERA)
+    gaps, withdrawn = [], []
+    for k, t_ns in enumerate(times_of_bunches(30, size)):
+        gaps.append(motion.comes_after_gap(t_ns))
+        withdrawn += motion.observe(k, t_ns, at(0.2 * k), POINTS)
+        assert not motion._still
+    assert withdrawn == []
+    assert not any(gaps[2 * size :]), "the first long interval may be one"
+    last_ns = times_of_bunches(30, size)[-1]
+    for later_ns in (2_000_000, size * FRAME_NS):
+        np.testing.assert_allclose(motion.predict(last_ns + later_ns), at(0.2 * 30), atol=0.01)
+    assert motion.comes_after_gap(last_ns + 40 * FRAME_NS)
+
+
+def test_before_it_is_known_that_times_mislead_one_more_step_is_another_guess():
+    motion = CameraMotion(CAMERA)
+    assert motion.predict_step() is None
+    for k, t_ns in enumerate(times_of_bunches(3, 3)):
+        motion.comes_after_gap(t_ns)
+        motion.observe(k, t_ns, at(0.2 * k), POINTS)
+        assert motion.predict_step() is None, "regular so far"
+    next_ns = times_of_bunches(4, 3)[3]
+    motion.comes_after_gap(next_ns)
+    assert motion.predict(next_ns)[0, 3] > 10.0
+    np.testing.assert_allclose(motion.predict_step(), at(0.6), atol=0.01)
+    motion.correct(at(0.2), scale=0.5)
+    np.testing.assert_allclose(motion.predict_step()[:3, 3], at(0.3)[:3, 3], atol=0.01)
+    motion.reset()
+    assert motion.predict_step() is None, "steps of another map"
+
+
+@pytest.mark.parametrize(("size", "first"), [(3, 0), pytest.param(5, 2, marks=pytest.mark.slow)])
+def test_a_road_is_driven_by_frames_that_come_in_bunches(size, first):
+    """Where the camera would be by their times, nothing is in sight: it was a new part with each bunch."""
+    sequence = open_sequence(STREET)
+    reconstruction = Reconstruction(
+        sequence.intrinsics, ReconstructionSettings(max_features=400), InlineBundle()
+    )
+    came_ns = times_of_bunches(30, size)
+    for k in range(first, 30):
+        reconstruction.process(DecodedFrame(k, came_ns[k], sequence.image(k)))
+    poses = reconstruction.final_trajectory()
+    submaps = set(reconstruction.world.part_of_frames().values())
+    reconstruction.close()
+    assert submaps == {0}
+    assert sorted(poses) == list(range(first, 30))
+    taken_ns = {k: int(sequence.times_ns[k]) for k in poses}
+    assert ate(trajectory_of(poses, taken_ns), sequence.groundtruth()).rmse < 0.1
+
+
 def test_less_than_the_error_of_poses_is_no_stop():
     assert go(CameraMotion(CAMERA), 0.01 * np.array([0, 1, 2, 3, 3, 3, 6, 7])) == {}
 

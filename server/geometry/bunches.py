@@ -1,0 +1,71 @@
+"""Frames that come in bunches, and whether their times tell how far the camera went between them.
+
+On networks and busy hubs frames wait for each other and come several at once, and some sources give them the
+time at which they came. By that, a camera stands still through a bunch and leaps to the next. Others do take
+several images in a row and rest. Times alone look the same; how the camera moved tells which it is.
+"""
+
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.geometry import log_so3, make_transform
+
+Array = NDArray[np.float64]
+
+#: An interval that is shorter than this share of the mean is within a bunch. Frames that are lost leave the
+#: intervals of the others as they are: two of three have to be lost for that.
+_BUNCH_SHARE = 1.0 / 3.0
+#: So many steps tell whether times mislead: several bunches of a few frames.
+_NUM_STEPS = 12
+#: From so many on.
+_LEAST_STEPS = 3
+
+
+def in_bunches(intervals_s: list[float]) -> bool:
+    """Tell whether any of these intervals is within a bunch."""
+    return len(intervals_s) > 1 and min(intervals_s) < _BUNCH_SHARE * float(np.mean(intervals_s))
+
+
+class Bunches:
+    """Remembers the last steps of a camera and the times they took."""
+
+    def __init__(self) -> None:
+        self._steps: list[tuple[float, Array]] = []
+        self._mislead = False
+
+    @property
+    def mislead(self) -> bool:
+        """Whether steps are alike and the times between frames are not: these tell no speed."""
+        return self._mislead
+
+    @property
+    def last(self) -> Array | None:
+        """The last step, ``T_before_now (4, 4)``; None before there is one."""
+        return self._steps[-1][1] if self._steps else None
+
+    def note(self, elapsed_s: float, T_before_now: Array) -> None:
+        """Take the step ``(4, 4)`` from one frame's pose to the next one's, and how long it took."""
+        self._steps = [*self._steps[1 - _NUM_STEPS :], (elapsed_s, T_before_now)]
+        times = [step_s for step_s, _ in self._steps]
+        self._mislead = len(times) >= _LEAST_STEPS and in_bunches(times) and self._are_alike()
+
+    def rescale(self, scale: float) -> None:
+        """Count ways in another unit, of which there are ``scale`` for one of the old."""
+        self._steps = [(step_s, make_transform(T[:3, :3], scale * T[:3, 3])) for step_s, T in self._steps]
+
+    def _are_alike(self) -> bool:
+        """Whether steps are more like the ones before them than they would be at the same speed."""
+        moves = [np.stack([T[:3, 3], log_so3(T[:3, :3])]) for _, T in self._steps]
+        # Of ways and of turns, each counted in their own length.
+        total = np.maximum(np.linalg.norm(moves, axis=2).sum(axis=0), 1e-12)
+        longer = [
+            max(after_s, 0.0) / max(before_s, 1e-9) for (before_s, _), (after_s, _) in pairwise(self._steps)
+        ]
+        at_speed = sum(
+            np.linalg.norm(after - times * before, axis=1)
+            for times, (before, after) in zip(longer, pairwise(moves), strict=True)
+        )
+        alike = sum(np.linalg.norm(after - before, axis=1) for before, after in pairwise(moves))
+        return float((alike / total).sum()) < float((at_speed / total).sum())
