@@ -244,6 +244,31 @@ def test_a_missing_file_is_named_once(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("channel --channel trace --trace file", "--trace-file must be given for trace 'file', got None"),
+        ("agent --source . --pace rate", "--rate-hz must be given for pace 'rate', got None"),
+        ("agent --source . --pace receiver", "--pace 'receiver' needs --mode 'replay', got mode 'live'"),
+        (
+            f"eval latency --sequence {DEMO} --codec jpeg-amc --max-frames 2",
+            "--warmup must leave frames to time, got 5 of 2",
+        ),
+    ],
+)
+def test_what_was_not_given_or_is_wrong_with_the_input_is_named_by_its_option(words, message, capsys):
+    assert main(words.split()) == 1
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert said.startswith(f"semcast {words.split()[0]}: {message}")
+
+
+def test_a_settings_file_may_hold_what_is_wrong_so_its_names_are_used(tmp_path, capsys):
+    file = tmp_path / "settings.toml"
+    file.write_text('channel = "trace"\ntrace = "file"\n')
+    assert main(["channel", "--config", str(file)]) == 1
+    assert ": trace_file must be given for trace 'file', got None\n" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
     ("words", "package", "extra"),
     [
         (["onnx", "3dcsc-lite"], "onnx", "train"),

@@ -166,7 +166,7 @@ def test_set_is_checked_against_the_running_channel(channel, tmp_path, capsys):
     now = json.loads(capsys.readouterr().out)
     assert (now["channel"], now["slot_loss"], now["burst_slots"]) == ("burst", 0.9, 20.0)
     assert main([*words, "--burst-slots", "4"]) == 1
-    assert "burst_slots must be at least 9 for a slot_loss of 0.9, got 4" in capsys.readouterr().err
+    assert "--burst-slots must be at least 9 for a slot_loss of 0.9, got 4" in capsys.readouterr().err
     file = tmp_path / "settings.toml"
     file.write_text("snr_db = 3\nslot_loss = 0.4\n")
     assert main([*words, "--config", str(file), "--slot-loss", "0.5"]) == 0

@@ -107,6 +107,8 @@ class _Parser(argparse.ArgumentParser):
             self._refuse(_unknown_options(words, self._option_string_actions))
         found, unknown = super().parse_known_args(words, namespace)
         self._refuse(unknown)
+        if self._subparsers is None:
+            found.known_options = frozenset(self._option_string_actions)
         return found, unknown
 
     def _refuse(self, unknown: list[str]) -> None:
@@ -215,6 +217,24 @@ def _plain(err: SemcastError) -> str:
     return str(err)
 
 
+def _by_options(message: str, known: Container[str]) -> str:
+    """Call the setting that an error begins with, and one that it needs, by their options.
+
+    Of a setting that was not given, and of all after they are read, errors say the name it has in a file.
+
+    Args:
+        message: Such as ``"warmup must leave frames to time, got 5 of 3"``.
+        known: Options of the verb; none where a file was given, in which the setting may stand.
+    """
+
+    def option(name: str) -> str:
+        shown = "--" + name.replace("_", "-")
+        return shown if shown in known else name
+
+    message = re.sub(r"^\w+(?= must )", lambda found: option(found[0]), message)
+    return re.sub(r"^(--\S+(?: '\S+')? needs )(\w+)", lambda found: found[1] + option(found[2]), message)
+
+
 def _stdout_fails() -> bool:
     try:
         print(flush=True)
@@ -271,9 +291,12 @@ def _run(words: list[str]) -> int:
         _leave_other_cores_alone()
     if verb in _WITH_FRAMES - {"agent"}:  # which may have little memory, and knows how it encodes
         keep_freed_memory()
+    known: Container[str] = ()
     try:
         parser = verb_parser(verb)
         arguments = parser.parse_args(arguments_last(parser, words[1:]))
+        if getattr(arguments, "config", None) is None:
+            known = arguments.known_options
         return int(arguments.command(arguments))
     except MissingSettingError as err:
         print(f"semcast {verb}: {err}", file=sys.stderr)
@@ -281,7 +304,7 @@ def _run(words: list[str]) -> int:
     except SemcastError as err:
         if debug:
             traceback.print_exc()
-        print(f"semcast {verb}: {_plain(err)}", file=sys.stderr)
+        print(f"semcast {verb}: {_by_options(_plain(err), known)}", file=sys.stderr)
         return EXIT_ERROR
     except PermissionError as err:  # Path.is_file raises it in a folder that may not be looked into
         if debug:

@@ -6,6 +6,7 @@ import pytest
 from bags import CONTAINERS, SECOND, BagMaker
 
 from semcast.agent.unpack import UnpackSettings, unpack
+from semcast.cli import main
 from semcast.common.errors import SourceError
 from semcast.common.sequence import open_sequence
 
@@ -320,6 +321,23 @@ def test_images_that_name_no_frame_need_one_for_the_truth(tmp_path):
         unpack(wanted)
     named = UnpackSettings(bag=wanted.bag, out=wanted.out, truth="base", camera_frame="cam")
     assert unpack(named).num_poses == 5
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([], "--image-topic must be given where not one topic has images"),
+        (["--image-topic", "/x"], "--image-topic must be one of those with images, "),
+        (["--image-topic", "/left", "--truth", "/x"], "--truth must be a topic of poses ("),
+    ],
+)
+def test_what_a_bag_does_not_have_is_named_by_its_option(words, message, tmp_path, capsys):
+    bag = BagMaker()
+    add_images(bag, "/left")
+    add_images(bag, "/right")
+    wanted = settings(bag, tmp_path)
+    assert main(["unpack", str(wanted.bag), "--out", str(wanted.out), *words]) == 1
+    assert capsys.readouterr().err.startswith(f"semcast unpack: {message}")
 
 
 def test_bad_images_are_left_out_and_counted(tmp_path, caplog):
