@@ -42,8 +42,10 @@ class MarkerSettings:
 
     def __post_init__(self) -> None:
         if self.side_m is None:
-            if self.dictionary != DEFAULT_DICTIONARY or self.marker_id is not None:
-                raise ValueError("marker_dictionary and marker_id need marker_m")
+            if self.marker_id is not None:
+                raise ValueError(f"marker_id needs marker_m, got {self.marker_id} without")
+            if self.dictionary != DEFAULT_DICTIONARY:
+                raise ValueError(f"marker_dictionary needs marker_m, got {self.dictionary!r} without")
             return
         if not 0.0 < self.side_m < math.inf:
             raise ValueError(f"marker_m must be above 0 and finite, got {self.side_m:g}")

@@ -249,6 +249,7 @@ def test_a_missing_file_is_named_once(tmp_path, capsys):
         ("channel --channel trace --trace file", "--trace-file must be given for trace 'file', got None"),
         ("agent --source . --pace rate", "--rate-hz must be given for pace 'rate', got None"),
         ("agent --source . --pace receiver", "--pace 'receiver' needs --mode 'replay', got mode 'live'"),
+        ("server --marker-id 3", "--marker-id needs --marker-m, got 3 without"),
         (
             f"eval latency --sequence {DEMO} --codec jpeg-amc --max-frames 2",
             "--warmup must leave frames to time, got 5 of 2",

@@ -335,8 +335,8 @@ def test_a_failure_ends_the_search_and_not_the_stream(caplog, monkeypatch):
         ({"side_m": 0.0}, "marker_m must be above 0 and finite, got 0"),
         ({"side_m": float("nan")}, "marker_m must be above 0"),
         ({"side_m": 0.2, "dictionary": "qr"}, "marker_dictionary must be one of .*4x4_50.*, got 'qr'"),
-        ({"marker_id": 3}, "need marker_m"),
-        ({"dictionary": "4x4_50"}, "need marker_m"),
+        ({"marker_id": 3}, "marker_id needs marker_m, got 3 without"),
+        ({"dictionary": "4x4_50"}, "marker_dictionary needs marker_m, got '4x4_50' without"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(given, what):
