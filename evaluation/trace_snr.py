@@ -20,10 +20,10 @@ def check_snrs(snr_db: Sequence[float], link: ChannelSettings, by_default: Seque
         ValueError: There is none, one is out of range, or there are several and a file has its own.
     """
     low, high = SNR_RANGE_DB
+    values = " ".join(f"{value:g}" for value in snr_db) or "none"
     if not snr_db or any(not low <= value <= high for value in snr_db):
-        raise ValueError(f"snr_db must be one or more values in [{low:g}, {high:g}], got {snr_db}")
+        raise ValueError(f"snr_db must be one or more values in [{low:g}, {high:g}], got {values}")
     if len(snr_db) > 1 and link.has_own_snr and tuple(snr_db) != tuple(by_default):
-        values = " ".join(f"{value:g}" for value in snr_db)
         raise ValueError(f"snr_db must be a single value with --trace file, which sets the SNR, got {values}")
 
 
