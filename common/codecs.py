@@ -10,7 +10,7 @@ from typing import Literal, get_args
 from semcast.common.codec import Codec, Device, Modulation, Precision, check_modulation
 from semcast.common.config import near_match
 from semcast.common.conventional_source import ImageFormat
-from semcast.common.errors import ConfigError
+from semcast.common.errors import CheckpointError, ConfigError
 
 logger = logging.getLogger(__name__)
 
@@ -76,8 +76,11 @@ def codec_of_weights(weights: Path, runtime: Runtime = "auto") -> str:
 
     Raises:
         ConfigError: The runtime is not installed.
-        CheckpointError: The weights are missing or damaged.
+        CheckpointError: The weights are missing or damaged, or a file of another kind.
     """
+    is_named = weights.suffix in _WEIGHTS_SUFFIXES or str(weights) in _shipped_weights()
+    if not is_named and weights.is_file():
+        raise CheckpointError(f"weights must be a {' or '.join(_WEIGHTS_SUFFIXES)} file, got {weights}")
     if _choose_runtime(runtime, weights) == "onnx":
         return _onnx_encoder(weights, "16qam", 1).name
     from semcast.common.nets.manifest import read_manifest, weights_path
