@@ -231,7 +231,7 @@ def _by_options(message: str, known: Container[str]) -> str:
         shown = "--" + name.replace("_", "-")
         return shown if shown in known else name
 
-    message = re.sub(r"^\w+(?= must )", lambda found: option(found[0]), message)
+    message = re.sub(r"^\w+(?= (must|can't) )", lambda found: option(found[0]), message)
     return re.sub(r"^(--\S+(?: '\S+')? needs )(\w+)", lambda found: found[1] + option(found[2]), message)
 
 
