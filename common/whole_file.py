@@ -30,6 +30,8 @@ def check_writable(path: Path, name: str) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
+    except FileExistsError as err:
+        raise ConfigError(f"{name} can't be written to {path}: {folder} is a file, not a folder") from err
     except OSError as err:
         raise ConfigError(f"{name} can't be written to {path}: {err.strerror}") from err
 

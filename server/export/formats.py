@@ -151,7 +151,10 @@ def _check_not_of_run(out: Path, folder: Path) -> None:
 
 
 def _check_kind(out: Path, format_name: str) -> None:
-    """Refuse a folder where the format is a file, and the other way round."""
+    """Refuse a folder where the format is a file, the other way round, and a place below a file."""
+    for parent in out.parents:
+        if parent.exists() and not parent.is_dir():
+            raise SourceError(f"{out} can't be written: {parent} is a file, not a folder")
     if FORMATS[format_name].startswith("FILE") and out.is_dir():
         raise SourceError(f"{out} is a folder; --format {format_name} writes a file")
     if FORMATS[format_name].startswith("FOLDER") and out.is_file():

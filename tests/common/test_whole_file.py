@@ -3,6 +3,7 @@ import threading
 
 import pytest
 
+from semcast.common.errors import ConfigError
 from semcast.common.whole_file import check_writable, whole_file, write_whole
 
 
@@ -48,6 +49,12 @@ def test_a_link_keeps_its_place_and_its_file_is_written(tmp_path):
 def test_a_file_without_a_folder_is_an_os_error(tmp_path):
     with pytest.raises(FileNotFoundError), whole_file(tmp_path / "no" / "a"):
         pass
+
+
+def test_a_file_where_a_folder_would_have_to_be_is_named(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match="json can't be written to .*/file/a: .*/file is a file, not"):
+        check_writable(tmp_path / "file" / "a", "json")
 
 
 def test_a_pipe_is_written_as_it_is_and_keeps_its_place(tmp_path):

@@ -349,6 +349,12 @@ def test_export_says_in_one_line_what_is_wrong(tmp_path, arc_run, write_arc_run,
     assert main(["export", str(tmp_path / "run"), "--format", "tum", "--out", str(tmp_path)]) == 1
     assert "is a folder" in capsys.readouterr().err
     (tmp_path / "file").write_text("")
+    for format_name, below in (("tum", "x.tum"), ("tum", "x/y.tum"), ("colmap", "x"), ("nerfstudio", "x")):
+        out = tmp_path / "file" / below
+        words = ["export", str(tmp_path / "run"), "--format", format_name, "--out", str(out)]
+        assert main(words) == 1
+        why = f"{out} can't be written: {tmp_path / 'file'} is a file, not a folder"
+        assert capsys.readouterr().err.splitlines()[-1] == f"semcast export: {why}"
     assert main(["export", str(tmp_path / "run"), "--format", "colmap", "--out", str(tmp_path / "file")]) == 1
     assert "is a file" in capsys.readouterr().err
 
