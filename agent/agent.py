@@ -280,9 +280,12 @@ def _send_lossless(
     while not stop.is_set():
         if not is_told and not window.is_wanted and time.monotonic() > expected_s:
             is_told = True
-            logger.warning(
-                "no server asks for frames: one in live mode takes none of an agent in replay mode (--mode)"
+            why = (
+                "one in live mode takes none of an agent in replay mode (--mode)"
+                if "server" in session.alive_roles(agent_id)
+                else f"there is none of the name {agent_id!r} (another --agent-id?)"
             )
+            logger.warning("no server asks for frames: %s", why)
         if encoded is None and not capture.ended:
             # While the receiver is busy, one frame is encoded ahead.
             frame = capture.get(_FLOW_POLL_S if window.all_taken else _BUSY_POLL_S)

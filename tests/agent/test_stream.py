@@ -161,6 +161,14 @@ def test_a_live_server_that_takes_no_replay_is_told_of(bench, caplog, monkeypatc
     assert agent.result["complete"] is False
 
 
+def test_a_replay_that_no_server_is_there_for_blames_no_mode(bench, caplog, monkeypatch):
+    monkeypatch.setattr("semcast.agent.agent.READY_S", 0.3)
+    agent = bench.agent("replay", wait=False)
+    until(lambda: "no server asks for frames: there is none of the name " in caplog.text)
+    agent.end()
+    assert "--mode" not in caplog.text
+
+
 def test_replay_is_the_same_every_time(bench):
     channel = bench.channel(channel="rayleigh", snr_db=5.0, frame_loss=0.2)
     receiver = bench.receiver("replay")
