@@ -199,6 +199,28 @@ def test_a_full_disk_behind_standard_output_is_told_in_a_line(words, buffered):
     assert (done.returncode, done.stderr) == (1, ""), "who reads no further knows"
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
+@pytest.mark.parametrize("buffered", [True, False])
+@pytest.mark.parametrize(
+    ("words", "code", "out"),
+    [
+        (["eval", "codec", "--images", str(DEMO / "images"), "--codec", "jpeg-ldpc"], 0, "jpeg-ldpc "),
+        (["info", "/no/where"], 1, ""),
+        (["wrong"], 2, ""),
+    ],
+)
+def test_a_log_that_finds_no_room_costs_no_result(words, code, out, buffered):
+    if code == 0:
+        words = [*words, "--max-images", "1", "--snr-db", "10"]
+    environment = {**os.environ, "PYTHONUNBUFFERED": "" if buffered else "1"}
+    command = [sys.executable, "-m", "semcast", *words]
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(command, stdout=subprocess.PIPE, stderr=full, text=True, env=environment)
+    assert done.returncode == code
+    assert out in done.stdout
+    assert bool(done.stdout) == bool(out), "not even an empty line"
+
+
 @pytest.mark.parametrize(
     "words",
     ["channel --help --typo", "channel --typo x -h", "channel wrong --help", "eval codec --typo --help"],

@@ -15,8 +15,8 @@ import shutil
 import sys
 import textwrap
 import traceback
-from collections.abc import Container, Sequence
-from typing import TYPE_CHECKING, Any, NoReturn
+from collections.abc import Container, Iterator, Sequence
+from typing import TYPE_CHECKING, Any, NoReturn, TextIO, cast
 
 from semcast import SemcastError, __version__
 from semcast.common.argument_order import arguments_last
@@ -243,16 +243,60 @@ def _stdout_fails() -> bool:
     return False
 
 
-def _drop_stdout() -> None:
-    """Let what stdout still holds go nowhere: the interpreter would try again at the end, and trace."""
+def _drop(stream: TextIO) -> None:
+    """Let what a stream still holds go nowhere: the interpreter would try again at the end, and trace."""
     with contextlib.suppress(OSError):  # one that is no file
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+class _Talk:
+    """Standard error, where lines that can't be written are left out: they must not cost a result."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        """Write the text, if that is possible."""
+        with contextlib.suppress(OSError):
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        """Write what is held, if that is possible."""
+        with contextlib.suppress(OSError):
+            self._stream.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+@contextlib.contextmanager
+def _talk_may_be_lost() -> Iterator[None]:
+    """Go on, and end with the same exit code, where standard error can't be written."""
+    stream = sys.stderr
+    if stream is None:
+        yield
+        return
+    sys.stderr = cast("TextIO", _Talk(stream))
+    try:
+        yield
+    finally:
+        sys.stderr = stream
+        try:
+            stream.flush()
+        except OSError:
+            _drop(stream)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     words = list(sys.argv[1:] if argv is None else argv)
     _show_all_names()
+    with _talk_may_be_lost():
+        return _main(words)
+
+
+def _main(words: list[str]) -> int:
     try:
         try:
             return _run(words)
@@ -264,7 +308,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except OSError as err:
         if not _stdout_fails() or "--debug" in words:
             raise
-        _drop_stdout()
+        _drop(sys.stdout)
         if not isinstance(err, BrokenPipeError):  # who reads no further knows
             print(f"semcast: standard output can't be written: {err.strerror}", file=sys.stderr)
         return EXIT_ERROR
