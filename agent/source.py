@@ -294,6 +294,8 @@ def open_source(settings: SourceSettings) -> Source:
             "rate_hz: no effect on %s, whose images have times of their own; --pace rate sends at it",
             source.name,
         )
+    if settings.layout != "auto" and not isinstance(source, RecordedSource):
+        logger.warning("layout: no effect on %s, which is no folder", source.name)
     return source
 
 

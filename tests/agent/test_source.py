@@ -138,7 +138,7 @@ def test_a_folder_without_times_has_the_same_however_fast_it_is_played(recording
     assert [frame.t_source_ns for frame in frames] == [0, step_ns, 2 * step_ns]
 
 
-def test_a_rate_that_the_times_of_a_video_overrule_is_said(tmp_path, caplog):
+def test_a_rate_and_a_layout_that_a_video_overrules_are_said(tmp_path, caplog):
     video = tmp_path / "steady.avi"
     writer = cv2.VideoWriter(str(video), cv2.VideoWriter_fourcc(*"MJPG"), 25.0, (64, 48))
     for k in range(3):
@@ -150,6 +150,9 @@ def test_a_rate_that_the_times_of_a_video_overrule_is_said(tmp_path, caplog):
     assert not caplog.text
     open_source(SourceSettings(**same, rate_hz=7.0)).close()
     assert "rate_hz: no effect on steady.avi" in caplog.text
+    caplog.clear()
+    open_source(SourceSettings(**same, layout="tum")).close()
+    assert [r.getMessage() for r in caplog.records] == ["layout: no effect on steady.avi, which is no folder"]
 
 
 def test_recorded_pace_takes_the_recorded_time(recording):
