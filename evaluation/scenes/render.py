@@ -151,8 +151,11 @@ class RenderSettings:
             raise ValueError(f"noise_sd must be in [0, 50], got {self.noise_sd:g}")
         if not 0 < self.brightness <= 1:
             raise ValueError(f"brightness must be in (0, 1], got {self.brightness:g}")
-        if not 0 <= self.readout_ms <= 100:
-            raise ValueError(f"readout_ms must be in [0, 100], got {self.readout_ms:g}")
+        most_ms = 1e3 / SCENES[self.scene].rate_hz  # the next frame begins
+        if not 0 <= self.readout_ms <= most_ms:
+            raise ValueError(
+                f"readout_ms must be in [0, {most_ms:.3g}] for scene {self.scene!r}, got {self.readout_ms:g}"
+            )
         check_distortion(self.distortion_model, self.distortion)
 
 

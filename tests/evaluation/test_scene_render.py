@@ -33,7 +33,7 @@ def painted_once(monkeypatch: pytest.MonkeyPatch) -> None:
         assert (seed, pace) == (0, "normal")
         return copy.copy(scene)
 
-    painted.camera = Orbit.camera  # type: ignore[attr-defined]
+    painted.camera, painted.rate_hz = Orbit.camera, Orbit.rate_hz  # type: ignore[attr-defined]
     monkeypatch.setitem(SCENES, "orbit", painted)
 
 
@@ -90,10 +90,11 @@ def test_a_disk_without_room_is_said_with_its_reason(
 
 
 def test_a_folder_with_files_is_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = RenderSettings(seconds=0.1, out=tmp_path)
     monkeypatch.setitem(SCENES, "room", lambda *_: pytest.fail("seconds of painting for nothing"))
     (tmp_path / "mine.txt").write_text("precious")
     with pytest.raises(SourceError, match="has files in it"):
-        render_scene(RenderSettings(seconds=0.1, out=tmp_path))
+        render_scene(settings)
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 
 
@@ -166,6 +167,13 @@ def test_the_camera_of_a_rolling_shutter_says_so(tmp_path: Path, painted_once: N
     render_scene(RenderSettings(scene="orbit", seconds=0.1, readout_ms=12.5, out=folder))
     camera = open_sequence(folder).intrinsics
     assert (camera.readout_ms, camera.readout_from) == (12.5, "top")
+
+
+def test_a_rolling_shutter_is_through_before_the_next_frame(tmp_path: Path) -> None:
+    for scene, fits_ms, too_long_ms in (("room", 33.0, 34.0), ("street", 100.0, 101.0)):
+        assert RenderSettings(scene=scene, readout_ms=fits_ms, out=tmp_path).readout_ms == fits_ms
+        with pytest.raises(ValueError, match=rf"readout_ms must be in \[0, .*\] for scene '{scene}', got"):
+            RenderSettings(scene=scene, readout_ms=too_long_ms, out=tmp_path)
 
 
 def test_rows_of_a_rolling_shutter_are_drawn_at_their_times() -> None:
