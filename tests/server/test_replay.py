@@ -478,7 +478,7 @@ def test_a_time_range_without_frames_is_one_clear_error(recording, tmp_path):
         (["--start-s", "nan"], "--start-s must be at least 0 and finite, got nan"),
         (["--start-s", "-1"], "--start-s must be at least 0 and finite, got -1"),
         (["--end-s", "nan"], "--end-s must be later than start_s (0), got nan"),
-        (["--save-images", "all"], "--save-images needs out, got save_images='all' without a folder"),
+        (["--save-images", "all"], "--save-images needs --out, got save_images='all' without a folder"),
         (["--fx", "9", "--fy", "9", "--cx", "9", "--cy", "9"], "--fx is of the camera of the reference"),
         (["--seed", "-1"], "--seed must be in [0, 2147483647], got -1"),
         (["--threads", "99999"], "--threads must be in [1, 1024], got 99999"),
