@@ -26,6 +26,7 @@ _SEEDS = {
     "street_night": 105,
     "survey": 106,
     "corridor": 107,
+    "flat": 108,
 }
 _LINK_DB = 6.0
 #: The longest scene and the nights are measured behind that link alone, all others behind a worse one too.
@@ -35,6 +36,7 @@ _PACES: tuple[Pace, ...] = ("normal", "fast")
 #: lost, is measured apart: evaluation/results/lorry_*.json name the commands.
 SCENE_SECONDS: dict[SceneName, tuple[float, float]] = {
     "room": (10.0, 10.0),
+    "flat": (12.0, 12.0),
     "street": (20.0, 20.0),
     "orbit": (10.0, 10.0),
     "block": (44.0, 30.0),

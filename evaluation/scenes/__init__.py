@@ -2,6 +2,7 @@
 
 Scenes
     room      a furnished room, through a handheld camera
+    flat      the same with bare walls and few things
     street    a drive through streets, with traffic
     block     the same, once round a block and on
     lorry     the street, behind a lorry

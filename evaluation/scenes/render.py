@@ -17,6 +17,7 @@ from semcast.common.trajectory import Trajectory, write_tum
 from semcast.common.whole_file import write_whole
 from semcast.evaluation.scenes.block import Block
 from semcast.evaluation.scenes.corridor import Corridor
+from semcast.evaluation.scenes.flat import Flat
 from semcast.evaluation.scenes.lorry import Lorry
 from semcast.evaluation.scenes.motion import Pace
 from semcast.evaluation.scenes.optics import Optics
@@ -51,9 +52,10 @@ class Scene(Protocol):
         """Return ``(H, W, 3)`` grey levels of what is seen where no surface is."""
 
 
-SceneName = Literal["room", "street", "block", "lorry", "orbit", "survey", "corridor"]
+SceneName = Literal["room", "flat", "street", "block", "lorry", "orbit", "survey", "corridor"]
 SCENES: dict[SceneName, type[Room] | type[Orbit] | type[Street] | type[Survey] | type[Corridor]] = {
     "room": Room,
+    "flat": Flat,
     "street": Street,
     "block": Block,
     "lorry": Lorry,
@@ -116,9 +118,10 @@ class RenderSettings:
     scene: SceneName = field(
         default="room",
         metadata={
-            "help": "room: handheld, 30 Hz; street: from a car, 10 Hz; block: the same round a block of "
-            "houses and on; lorry: the street behind a lorry; orbit: round a still life, 10 Hz; survey: "
-            "fields from a drone that looks down, 10 Hz; corridor: bare walls from a small robot, 15 Hz"
+            "help": "room: handheld, 30 Hz; flat: a room with bare walls, handheld, 15 Hz; street: from a car, "
+            "10 Hz; block: the same round a block of houses and on; lorry: the street behind a lorry; orbit: "
+            "round a still life, 10 Hz; survey: fields from a drone that looks down, 10 Hz; corridor: bare "
+            "walls from a small robot, 15 Hz"
         },
     )
     pace: Pace = field(default="normal", metadata={"help": "how fast the camera moves and shakes"})
