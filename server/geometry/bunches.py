@@ -10,12 +10,11 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from semcast.common.geometry import log_so3, make_transform
+from semcast.common.geometry import exp_so3, log_so3, make_transform
 
 Array = NDArray[np.float64]
 
-#: An interval that is shorter than this share of the mean is within a bunch. Frames that are lost leave the
-#: intervals of the others as they are: two of three have to be lost for that.
+#: An interval that is shorter than this share of the mean is within a bunch.
 _BUNCH_SHARE = 1.0 / 3.0
 #: So many steps tell whether times mislead: several bunches of a few frames.
 _NUM_STEPS = 12
@@ -24,7 +23,7 @@ _LEAST_STEPS = 3
 
 
 def in_bunches(intervals_s: list[float]) -> bool:
-    """Tell whether any of these intervals is within a bunch."""
+    """Tell whether any of these intervals, each shared among the frames it has lost, is within a bunch."""
     return len(intervals_s) > 1 and min(intervals_s) < _BUNCH_SHARE * float(np.mean(intervals_s))
 
 
@@ -42,12 +41,18 @@ class Bunches:
 
     @property
     def last(self) -> Array | None:
-        """The last step, ``T_before_now (4, 4)``; None before there is one."""
+        """The last step, ``T_before_now (4, 4)`` of one frame; None before there is one."""
         return self._steps[-1][1] if self._steps else None
 
-    def note(self, elapsed_s: float, T_before_now: Array) -> None:
-        """Take the step ``(4, 4)`` from one frame's pose to the next one's, and how long it took."""
-        self._steps = [*self._steps[1 - _NUM_STEPS :], (elapsed_s, T_before_now)]
+    def note(self, elapsed_s: float, T_before_now: Array, num_frames: int = 1) -> None:
+        """Take the step ``(4, 4)`` from one pose to another ``num_frames`` on, and how long it took.
+
+        Frames that are missing in between count as steps of their own, all alike: regular frames around a
+        gap come in no bunches.
+        """
+        turn, way = log_so3(T_before_now[:3, :3]) / num_frames, T_before_now[:3, 3] / num_frames
+        step = (elapsed_s / num_frames, make_transform(exp_so3(turn), way))
+        self._steps = [*self._steps[1 - _NUM_STEPS :], step]
         times = [step_s for step_s, _ in self._steps]
         self._mislead = len(times) >= _LEAST_STEPS and in_bunches(times) and self._are_alike()
 

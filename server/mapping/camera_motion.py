@@ -59,7 +59,8 @@ class CameraMotion:
 
     def __init__(self, camera: Intrinsics) -> None:
         self._camera = camera
-        self._came_ns: list[int] = []
+        #: Of the last frames that came: number and time.
+        self._came: list[tuple[int, int]] = []
         self.reset()
 
     def reset(self) -> None:
@@ -67,6 +68,7 @@ class CameraMotion:
         self._motion = ConstantVelocity()
         self._bunches = Bunches()
         self._moving: tuple[int, Array] | None = None
+        self._moving_id = 0
         self._still: list[int] = []
         self._still_ns = 0
         self._has_gap = False
@@ -108,7 +110,7 @@ class CameraMotion:
         By their times the camera would stand still in a bunch and be far off at the next, which it may have
         done or not.
         """
-        if self._still or not in_bunches(self._intervals_ns()):
+        if self._still or not in_bunches([ns / num for ns, num in self._intervals()]):
             return None
         return self._one_more_step()
 
@@ -143,22 +145,24 @@ class CameraMotion:
         """As ``ConstantVelocity.bridge_variances``."""
         return self._motion.bridge_variances(t_source_ns, later_s)
 
-    def comes_after_gap(self, t_source_ns: int) -> bool:
+    def comes_after_gap(self, frame_id: int, t_source_ns: int) -> bool:
         """Note that a frame has come, and tell whether frames are missing between the last pose and it.
 
         Args:
-            t_source_ns: Time of the frame. Much further from the one before than that was from its own, some
+            frame_id: Of the frame.
+            t_source_ns: Its time. Much further from the one before than that was from its own, some
                 are missing; where times mislead, much further than any of late.
         """
-        if intervals_ns := self._intervals_ns():
-            usual_ns = max(intervals_ns) if self._bunches.mislead else intervals_ns[-1]
+        if intervals := self._intervals():
+            usual_ns, _ = max(intervals) if self._bunches.mislead else intervals[-1]
             # Of a source that gives two images one time, these tell no interval.
-            self._has_gap |= t_source_ns - self._came_ns[-1] > _GAP_INTERVALS * usual_ns > 0.0
-        self._came_ns = [*self._came_ns[-_NUM_INTERVALS:], t_source_ns]
+            self._has_gap |= t_source_ns - self._came[-1][1] > _GAP_INTERVALS * usual_ns > 0.0
+        self._came = [*self._came[-_NUM_INTERVALS:], (frame_id, t_source_ns)]
         return self._has_gap
 
-    def _intervals_ns(self) -> list[float]:
-        return [float(after - before) for before, after in pairwise(self._came_ns)]
+    def _intervals(self) -> list[tuple[int, int]]:
+        """Nanoseconds from each of the last frames to the next, and how many frames on that is."""
+        return [(now[1] - before[1], now[0] - before[0]) for before, now in pairwise(self._came)]
 
     def observe(
         self, frame_id: int, t_source_ns: int, T_world_cam: Array, xyz: Array, *, stands: bool = False
@@ -180,13 +184,13 @@ class CameraMotion:
         self._rests |= stands
         T_world_go = self._motion.predict(t_source_ns)
         if self._moving is None or T_world_go is None:
-            self._go_on(t_source_ns, T_world_cam)
+            self._go_on(frame_id, t_source_ns, T_world_cam)
             return []
         since_ns, T_world_moving = self._moving
         moved, expected = self._displacements(T_world_moving, (T_world_cam, T_world_go), xyz)
         (moved_px, most_px), (expected_px, most_expected_px) = _lengths(moved), _lengths(expected)
         if not self._still and expected_px < _LEAST_EXPECTED_PX:
-            self._go_on(t_source_ns, T_world_cam)
+            self._go_on(frame_id, t_source_ns, T_world_cam)
             return []
         # From here on, motions are counted in those from the frame before to this one.
         before_ns = self._still_ns if self._still else since_ns
@@ -209,7 +213,7 @@ class CameraMotion:
                 withdrawn = self._still
             elif len(self._still) > _SHORT_STAY:
                 self._motion.observe(self._still_ns, T_world_moving)
-        self._go_on(t_source_ns, T_world_cam)
+        self._go_on(frame_id, t_source_ns, T_world_cam)
         return withdrawn
 
     def give_up(self) -> list[int]:
@@ -232,15 +236,17 @@ class CameraMotion:
         # A camera that turned right round has no point in front of it both then and now.
         self._rests = t_source_ns - since_ns >= _REST_NS and len(moved) > 0 and is_near
 
-    def _go_on(self, t_source_ns: int, T_world_cam: Array) -> None:
+    def _go_on(self, frame_id: int, t_source_ns: int, T_world_cam: Array) -> None:
         if self._moving is not None and not self._still:
             before_ns, T_world_before = self._moving
+            T_before_now = invert_transform(T_world_before) @ T_world_cam
             self._bunches.note(
-                (t_source_ns - before_ns) * _S_PER_NS, invert_transform(T_world_before) @ T_world_cam
+                (t_source_ns - before_ns) * _S_PER_NS, T_before_now, frame_id - self._moving_id
             )
             self._motion.times_mislead = self._bunches.mislead
         self._motion.observe(t_source_ns, T_world_cam)
         self._moving = (t_source_ns, T_world_cam.copy())
+        self._moving_id = frame_id
         self._still = []
 
     def _displacements(self, T_world_from: Array, to: Sequence[Array], xyz: Array) -> list[Array]:

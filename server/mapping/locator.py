@@ -69,7 +69,7 @@ class Locator:
     def follow(self, sight: Sight, T_world_guess: Array | None) -> None:
         """Follow the tracks into an image: to where a pose expects them, or on as they went so far."""
         tracks = self._tracks
-        self._is_after_gap = self._motion.comes_after_gap(sight.frame.t_source_ns)
+        self._is_after_gap = self._motion.comes_after_gap(sight.frame.frame_id, sight.frame.t_source_ns)
         self.whereabouts = None
         if self._is_after_gap:
             self.whereabouts = self._motion.whereabouts(sight.frame.t_source_ns, self._map.depth())

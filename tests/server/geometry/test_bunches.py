@@ -73,6 +73,14 @@ def test_frames_of_one_time_are_a_bunch():
     assert noted([0.0, 0.0, 0.3] * 3, [TWIST] * 9).mislead
 
 
+def test_a_step_over_missing_frames_counts_as_one_of_each_of_them():
+    bunches = noted([PERIOD_S] * 11, [TWIST] * 11)
+    # Nearer than the speed led: what comes after a gap looks like a bunch but for the frames in between.
+    bunches.note(30 * PERIOD_S, exp_se3(10 * TWIST), num_frames=30)
+    assert not bunches.mislead
+    np.testing.assert_allclose(bunches.last, exp_se3(TWIST / 3), atol=0.02)
+
+
 def test_the_last_step_is_told_in_another_unit():
     bunches = noted(waiting(3), [TWIST] * 12)
     bunches.rescale(2.0)

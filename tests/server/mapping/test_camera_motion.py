@@ -102,24 +102,24 @@ def test_a_camera_that_stood_sets_off_from_rest():
 
 def test_a_gap_is_longer_than_the_frames_before_were_apart():
     motion = CameraMotion(CAMERA)
-    assert not motion.comes_after_gap(0)
-    assert not motion.comes_after_gap(5 * FRAME_NS), "nothing is known yet"
-    assert not motion.comes_after_gap(20 * FRAME_NS), "three intervals"
-    assert motion.comes_after_gap(66 * FRAME_NS)
-    assert motion.comes_after_gap(67 * FRAME_NS), "until there is a pose"
+    assert not motion.comes_after_gap(0, 0)
+    assert not motion.comes_after_gap(5, 5 * FRAME_NS), "nothing is known yet"
+    assert not motion.comes_after_gap(20, 20 * FRAME_NS), "three intervals"
+    assert motion.comes_after_gap(66, 66 * FRAME_NS)
+    assert motion.comes_after_gap(67, 67 * FRAME_NS), "until there is a pose"
     motion.observe(67, 67 * FRAME_NS, at(0.0), POINTS)
-    assert not motion.comes_after_gap(68 * FRAME_NS)
-    assert motion.comes_after_gap(72 * FRAME_NS)
+    assert not motion.comes_after_gap(68, 68 * FRAME_NS)
+    assert motion.comes_after_gap(72, 72 * FRAME_NS)
     motion.reset()
-    assert not motion.comes_after_gap(73 * FRAME_NS)
-    assert not motion.comes_after_gap(74 * FRAME_NS)
-    assert motion.comes_after_gap(78 * FRAME_NS), "how often frames come is known still"
+    assert not motion.comes_after_gap(73, 73 * FRAME_NS)
+    assert not motion.comes_after_gap(74, 74 * FRAME_NS)
+    assert motion.comes_after_gap(78, 78 * FRAME_NS), "how often frames come is known still"
 
 
 def test_images_that_share_a_time_tell_no_interval():
     motion = CameraMotion(CAMERA)
     times = np.repeat(np.arange(4), 2) * FRAME_NS
-    assert not any(motion.comes_after_gap(int(t_ns)) for t_ns in times)
+    assert not any(motion.comes_after_gap(k, int(t_ns)) for k, t_ns in enumerate(times))
 
 
 def test_a_row_of_equal_houses_does_not_hold_the_camera_back_after_a_gap():
@@ -146,7 +146,7 @@ def test_a_camera_whose_frames_come_in_bunches_neither_stops_nor_is_gone(size):
     motion = CameraMotion(CAMERA)
     gaps, withdrawn = [], []
     for k, t_ns in enumerate(times_of_bunches(30, size)):
-        gaps.append(motion.comes_after_gap(t_ns))
+        gaps.append(motion.comes_after_gap(k, t_ns))
         withdrawn += motion.observe(k, t_ns, at(0.2 * k), POINTS)
         assert not motion._still
     assert withdrawn == []
@@ -154,18 +154,32 @@ def test_a_camera_whose_frames_come_in_bunches_neither_stops_nor_is_gone(size):
     last_ns = times_of_bunches(30, size)[-1]
     for later_ns in (2_000_000, size * FRAME_NS):
         np.testing.assert_allclose(motion.predict(last_ns + later_ns), at(0.2 * 30), atol=0.01)
-    assert motion.comes_after_gap(last_ns + 40 * FRAME_NS)
+    assert motion.comes_after_gap(70, last_ns + 40 * FRAME_NS)
+
+
+@pytest.mark.parametrize(("num_before", "num_lost"), [(3, 7), (15, 26), (15, 60)])
+def test_regular_frames_around_a_gap_come_in_no_bunches(num_before, num_lost):
+    """A hand that sways is nearer to where it was than its speed led after it, as after a bunch."""
+    motion, after = CameraMotion(CAMERA), num_before + num_lost
+    for k in (*range(num_before), *range(after, after + 5)):
+        motion.comes_after_gap(k, k * FRAME_NS)
+        assert motion.predict_step() is None
+        x = 0.3 * np.sin(0.105 * k)
+        if k > after:
+            assert abs(motion.predict(k * FRAME_NS)[0, 3] - x) < 0.1
+        motion.observe(k, k * FRAME_NS, at(x), POINTS)
+    assert motion.comes_after_gap(after + 15, (after + 15) * FRAME_NS), "another one"
 
 
 def test_before_it_is_known_that_times_mislead_one_more_step_is_another_guess():
     motion = CameraMotion(CAMERA)
     assert motion.predict_step() is None
     for k, t_ns in enumerate(times_of_bunches(3, 3)):
-        motion.comes_after_gap(t_ns)
+        motion.comes_after_gap(k, t_ns)
         motion.observe(k, t_ns, at(0.2 * k), POINTS)
         assert motion.predict_step() is None, "regular so far"
     next_ns = times_of_bunches(4, 3)[3]
-    motion.comes_after_gap(next_ns)
+    motion.comes_after_gap(3, next_ns)
     assert motion.predict(next_ns)[0, 3] > 10.0
     np.testing.assert_allclose(motion.predict_step(), at(0.6), atol=0.01)
     motion.correct(at(0.2), scale=0.5)
@@ -302,7 +316,7 @@ def test_a_camera_of_which_frames_are_missing_may_have_gone_on_and_does_not_rest
     motion = CameraMotion(CAMERA)
     go(motion, [5.5 + 0.01 * (-1) ** k for k in range(14)])
     for k in (12, 13, 14):
-        motion.comes_after_gap(k * FRAME_NS)
+        motion.comes_after_gap(k, k * FRAME_NS)
     assert motion.rests
-    motion.comes_after_gap(24 * FRAME_NS)
+    motion.comes_after_gap(24, 24 * FRAME_NS)
     assert not motion.rests
