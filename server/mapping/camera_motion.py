@@ -108,8 +108,11 @@ class CameraMotion:
         """Where one more step like the last leads, None unless the newest frames came in bunches.
 
         By their times the camera would stand still in a bunch and be far off at the next, which it may have
-        done or not.
+        done or not. Once it is known that they mislead, ``predict`` tells this, and there is no other guess.
         """
+        return None if self._bunches.mislead else self._step_in_bunch()
+
+    def _step_in_bunch(self) -> Array | None:
         if self._still or not in_bunches([ns / num for ns, num in self._intervals()]):
             return None
         return self._one_more_step()
@@ -197,7 +200,7 @@ class CameraMotion:
         known_ns = min(t_source_ns - since_ns, round(MAX_EXTRAPOLATION_S / _S_PER_NS))
         steps = known_ns / max(1, t_source_ns - before_ns)
         still_px = _STILL_SHARE * most_expected_px / max(1.0, steps)
-        if (T_world_step := self.predict_step()) is not None:
+        if (T_world_step := self._step_in_bunch()) is not None:
             # In a bunch, what moves by as much as from the frame before to the last has not stopped.
             (step,) = self._displacements(T_world_moving, [T_world_step], xyz)
             still_px = min(still_px, _STILL_SHARE * _lengths(step)[1])

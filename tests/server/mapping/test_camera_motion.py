@@ -154,6 +154,7 @@ def test_a_camera_whose_frames_come_in_bunches_neither_stops_nor_is_gone(size):
     last_ns = times_of_bunches(30, size)[-1]
     for later_ns in (2_000_000, size * FRAME_NS):
         np.testing.assert_allclose(motion.predict(last_ns + later_ns), at(0.2 * 30), atol=0.01)
+    assert motion.predict_step() is None, "what was tried is no other guess"
     assert motion.comes_after_gap(70, last_ns + 40 * FRAME_NS)
 
 
