@@ -221,6 +221,13 @@ def test_a_log_that_finds_no_room_costs_no_result(words, code, out, buffered):
     assert bool(done.stdout) == bool(out), "not even an empty line"
 
 
+@pytest.mark.parametrize(("words", "code"), [("info /no/where", 1), ("wrong", 2)])
+def test_what_a_closed_standard_error_would_be_told_is_not_among_the_results(words, code):
+    command = f"exec {sys.executable} -m semcast {words} 2>&-"
+    done = subprocess.run(["sh", "-c", command], stdout=subprocess.PIPE, text=True)
+    assert (done.returncode, done.stdout) == (code, "")
+
+
 @pytest.mark.parametrize(
     "words",
     ["channel --help --typo", "channel --typo x -h", "channel wrong --help", "eval codec --typo --help"],

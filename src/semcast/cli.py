@@ -274,8 +274,9 @@ class _Talk:
 def _talk_may_be_lost() -> Iterator[None]:
     """Go on, and end with the same exit code, where standard error can't be written."""
     stream = sys.stderr
-    if stream is None:
-        yield
+    if stream is None:  # it is closed, and print would take standard output for it
+        with open(os.devnull, "w") as nowhere, contextlib.redirect_stderr(nowhere):
+            yield
         return
     sys.stderr = cast("TextIO", _Talk(stream))
     try:
