@@ -37,6 +37,9 @@ _MIN_TRACKS = 30
 _ITERATIONS = 6
 #: Images further apart than this say little about how the camera moved during an exposure.
 _MAX_STEP_S = 0.5
+#: An image is read before the next one begins: one that comes sooner after it than this share of the readout
+#: was not taken then.
+_LEAST_READ_SHARE = 0.5
 #: A hand shakes several times a second: from images further apart no trend of the movement is read.
 _MAX_TREND_STEP_S = 0.06
 #: Steps that the trend is read from. At 30 images a second two are wrong by 13 % about a hand that shakes at
@@ -197,7 +200,7 @@ class RollingShutter:
 
     def see(self, frame: DecodedFrame) -> Sight:
         """Return an image put right by the movement before it, for tracks to be followed in."""
-        if not SAME_S < self._since_s(frame) < _MAX_STEP_S:
+        if not self._tells(self._since_s(frame)):
             self._flow = None
             self._steps.clear()
         return self._sight(frame, with_colours=False)
@@ -261,6 +264,10 @@ class RollingShutter:
     def _since_s(self, frame: DecodedFrame) -> float:
         return 0.0 if self._t_ns is None else (frame.t_source_ns - self._t_ns) * 1e-9
 
+    def _tells(self, step_s: float) -> bool:
+        """Whether two images so far apart tell how fast the later one moved."""
+        return max(SAME_S, _LEAST_READ_SHARE * 1e-3 * self.camera.readout_ms) < step_s < _MAX_STEP_S
+
     def _measure(self, frame_id: int, step_s: float, xy: Array, way: Array) -> None:
         """Take the movement at the newest image from points ``(N, 2)`` and their ways ``(N, 2)`` there."""
         self._flow = self._measured(step_s, xy, way)
@@ -271,7 +278,7 @@ class RollingShutter:
 
     def _measured(self, step_s: float, xy: Array, way: Array) -> ImageFlow | None:
         mean = None
-        if SAME_S < step_s < _MAX_STEP_S:
+        if self._tells(step_s):
             mean = ImageFlow.fitted(self.camera, xy - 0.5 * way, way / step_s)
         if mean is None:
             self._steps.clear()

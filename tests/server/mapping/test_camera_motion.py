@@ -1,5 +1,6 @@
 """Where the camera goes on to, and images that stayed while it did."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -189,13 +190,15 @@ def test_before_it_is_known_that_times_mislead_one_more_step_is_another_guess():
     assert motion.predict_step() is None, "steps of another map"
 
 
-@pytest.mark.parametrize(("size", "first"), [(3, 0), pytest.param(5, 2, marks=pytest.mark.slow)])
-def test_a_road_is_driven_by_frames_that_come_in_bunches(size, first):
+@pytest.mark.parametrize(
+    ("size", "first", "readout_ms"),
+    [(3, 0, 0.0), (5, 0, 10.0), pytest.param(5, 2, 0.0, marks=pytest.mark.slow)],
+)
+def test_a_road_is_driven_by_frames_that_come_in_bunches(size, first, readout_ms):
     """Where the camera would be by their times, nothing is in sight: it was a new part with each bunch."""
     sequence = open_sequence(STREET)
-    reconstruction = Reconstruction(
-        sequence.intrinsics, ReconstructionSettings(max_features=400), InlineBundle()
-    )
+    camera = replace(sequence.intrinsics, readout_ms=readout_ms)
+    reconstruction = Reconstruction(camera, ReconstructionSettings(max_features=400), InlineBundle())
     came_ns = times_of_bunches(30, size)
     for k in range(first, 30):
         reconstruction.process(DecodedFrame(k, came_ns[k], sequence.image(k)))

@@ -175,12 +175,13 @@ def test_without_enough_points_or_after_a_gap_nothing_is_assumed():
     assert not is_first
 
 
-def test_images_of_as_good_as_one_time_tell_no_movement():
+@pytest.mark.parametrize("since_ns", [1, 2_000_000], ids=["no time", "less than an image takes to be read"])
+def test_images_too_near_in_time_tell_no_movement(since_ns):
     shutter, tracks, t_ns = shutter_of(READOUT_MS), TrackTable("robust", 200, 0), 0
     for frame_id in range(4):
         frame = seen((300.0, 0.0), frame_id)
         if frame_id == 3:
-            frame = replace(frame, t_source_ns=t_ns + 1)
+            frame = replace(frame, t_source_ns=t_ns + since_ns)
         t_ns = frame.t_source_ns
         sight = shutter.see(frame)
         tracks.follow(sight, tracks.xy + tracks.velocity) if len(tracks) else tracks.remember(sight)
