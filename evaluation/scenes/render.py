@@ -118,10 +118,10 @@ class RenderSettings:
     scene: SceneName = field(
         default="room",
         metadata={
-            "help": "room: handheld, 30 Hz; flat: a room with bare walls, handheld, 15 Hz; street: from a car, "
-            "10 Hz; block: the same round a block of houses and on; lorry: the street behind a lorry; orbit: "
-            "round a still life, 10 Hz; survey: fields from a drone that looks down, 10 Hz; corridor: bare "
-            "walls from a small robot, 15 Hz"
+            "help": "room: handheld, 30 Hz; flat: a room with bare walls, handheld, 15 Hz; street: from a "
+            "car, 10 Hz; block: the same round a block of houses and on; lorry: the street behind a lorry; "
+            "orbit: round a still life, 10 Hz; survey: fields from a drone that looks down, 10 Hz; corridor: "
+            "bare walls from a small robot, 15 Hz"
         },
     )
     pace: Pace = field(default="normal", metadata={"help": "how fast the camera moves and shakes"})

@@ -8,7 +8,7 @@ several images in a row and rest. Times alone look the same; how the camera move
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from semcast.common.geometry import exp_so3, log_so3, make_transform
 
@@ -16,15 +16,18 @@ Array = NDArray[np.float64]
 
 #: An interval that is shorter than this share of the mean is within a bunch.
 _BUNCH_SHARE = 1.0 / 3.0
-#: So many steps tell whether times mislead: several bunches of a few frames.
-_NUM_STEPS = 12
-#: From so many on.
-_LEAST_STEPS = 3
+#: One that is longer than this share of it is one that frames waited for.
+_WAIT_SHARE = 1.5
+#: So many steps tell whether times mislead, of several bunches of a few frames or two of many,
+_NUM_STEPS = 24
+#: which began after so many waits: after a single one, a camera that hung has gone on.
+_LEAST_WAITS = 2
 
 
-def in_bunches(intervals_s: list[float]) -> bool:
+def in_bunches(intervals_s: ArrayLike) -> bool:
     """Tell whether any of these intervals, each shared among the frames it has lost, is within a bunch."""
-    return len(intervals_s) > 1 and min(intervals_s) < _BUNCH_SHARE * float(np.mean(intervals_s))
+    intervals = np.asarray(intervals_s, np.float64)
+    return len(intervals) > 1 and bool(intervals.min() < _BUNCH_SHARE * intervals.mean())
 
 
 class Bunches:
@@ -53,8 +56,11 @@ class Bunches:
         turn, way = log_so3(T_before_now[:3, :3]) / num_frames, T_before_now[:3, 3] / num_frames
         step = (elapsed_s / num_frames, make_transform(exp_so3(turn), way))
         self._steps = [*self._steps[1 - _NUM_STEPS :], step]
-        times = [step_s for step_s, _ in self._steps]
-        self._mislead = len(times) >= _LEAST_STEPS and in_bunches(times) and self._are_alike()
+        times = np.array([step_s for step_s, _ in self._steps])
+        has_bunches = (
+            in_bunches(times) and np.count_nonzero(times > _WAIT_SHARE * times.mean()) >= _LEAST_WAITS
+        )
+        self._mislead = bool(has_bunches) and self._are_alike()
 
     def rescale(self, scale: float) -> None:
         """Count ways in another unit, of which there are ``scale`` for one of the old."""

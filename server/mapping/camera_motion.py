@@ -46,7 +46,7 @@ _REST_SHARE = 0.03
 #: A frame comes after a gap if it comes after this many intervals of the frames before it.
 _GAP_INTERVALS = 3.0
 #: Where they come in bunches, and each after a long interval, it is so many of the longest of so many.
-_NUM_INTERVALS = 12
+_NUM_INTERVALS = 24
 _S_PER_NS = 1e-9
 
 

@@ -137,6 +137,7 @@ class Locator:
             and (T_world_step := self._motion.predict_step()) is not None
             and self._tracks.follow_again(sight, partial(self._expected, T_world_step))
         ):
+            # Not where times say it can be: it is asked for where those may mislead.
             pose = self.pose(T_world_step)
         if pose is None and self._tracks.follow_jump(sight):
             pose = self._possible(self.pose(T_world_guess))

@@ -26,9 +26,9 @@ def noted(intervals_s, twists):
 
 @pytest.mark.parametrize("size", [2, 3, 5, 9])
 def test_times_mislead_where_frames_waited_for_each_other(size):
-    intervals_s = waiting(size)
+    intervals_s = waiting(size, num=24)
     rng = np.random.default_rng(size)
-    twists = TWIST * rng.normal(1.0, 0.2, (12, 6))
+    twists = TWIST * rng.normal(1.0, 0.2, (24, 6))
     assert in_bunches(intervals_s)
     assert noted(intervals_s, twists).mislead
 
@@ -62,11 +62,18 @@ def test_regular_and_lost_frames_come_in_no_bunches(intervals_s):
 
 def test_only_the_last_steps_count():
     bunches = noted(waiting(3), [TWIST] * 12)
-    for _ in range(11):
+    # Of 24; it takes two waits, and the last but one is the ninth of the twelve.
+    for _ in range(20):
         assert bunches.mislead
         bunches.note(PERIOD_S, exp_se3(TWIST))
     bunches.note(PERIOD_S, exp_se3(TWIST))
     assert not bunches.mislead
+
+
+def test_a_camera_that_hung_once_has_gone_on():
+    times_s = [PERIOD_S] * 3 + [2.5] + [PERIOD_S] * 3
+    assert in_bunches(times_s)
+    assert not noted(times_s, [TWIST] * 7).mislead, "though one step is like the others"
 
 
 def test_frames_of_one_time_are_a_bunch():
