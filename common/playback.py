@@ -7,6 +7,12 @@ from numpy.typing import NDArray
 
 #: Between frames, where there is but one: that of ten a second.
 _PERIOD_OF_ONE_NS = 1e8
+#: Frames come in bunches, as a network lets them go, where some wait so many times as long as most do:
+_WAIT_STEPS = 6.0
+#: this share of them at least, which is one in a bunch of sixteen. A recording that paused has fewer.
+_WAITS_SHARE = 1.0 / 16.0
+#: A wait that is so many times as long as usual ones is a pause.
+_PAUSE_WAITS = 3.0
 
 
 def check_playback(
@@ -51,7 +57,15 @@ def check_part(start_s: float, end_s: float | None) -> None:
 def usual_period_ns(times_ns: NDArray[np.int64]) -> float:
     """Return the usual time between two frames, the median; that of ten a second where there is but one.
 
+    Of frames that come in bunches the median is that within a bunch: their mean is the camera's period.
+
     Args:
         times_ns: ``(N,)``, increasing.
     """
-    return float(np.median(np.diff(times_ns))) if len(times_ns) > 1 else _PERIOD_OF_ONE_NS
+    if len(times_ns) < 2:
+        return _PERIOD_OF_ONE_NS
+    steps_ns = np.diff(times_ns)
+    waits_ns = steps_ns[steps_ns > _WAIT_STEPS * np.quantile(steps_ns, _WAITS_SHARE)]
+    if len(waits_ns) < max(2.0, _WAITS_SHARE * len(steps_ns)):
+        return float(np.median(steps_ns))
+    return float(steps_ns[steps_ns <= _PAUSE_WAITS * np.median(waits_ns)].mean())

@@ -29,5 +29,21 @@ def test_a_gap_does_not_change_the_usual_period():
     assert usual_period_ns(np.array([0, 40, 80, 120, 900], np.int64)) == 40.0
 
 
+@pytest.mark.parametrize("size", [2, 3, 5, 12])
+def test_of_frames_in_bunches_the_period_is_that_of_the_camera(size):
+    times_ns = np.array([(k // size * size + size) * 100_000_000 + k % size * 2_000_000 for k in range(120)])
+    assert usual_period_ns(times_ns) == pytest.approx(100_000_000, rel=0.2)
+    times_ns[36:] += 40_000_000_000
+    assert usual_period_ns(times_ns) == pytest.approx(100_000_000, rel=0.2), "with a pause as well"
+
+
+def test_lost_frames_and_pauses_do_not_change_the_usual_period():
+    rng = np.random.default_rng(0)
+    came = np.flatnonzero(rng.random(200) > 0.5) * 40
+    assert usual_period_ns(came) == 40.0
+    paused = np.arange(60) * 40 + 1000 * (np.arange(60) // 20)
+    assert usual_period_ns(paused) == 40.0
+
+
 def test_one_frame_counts_as_ten_a_second():
     assert usual_period_ns(np.array([7], np.int64)) * 1e-9 == 0.1
