@@ -245,15 +245,6 @@ def test_weights_decide_on_the_codec_unless_one_is_named(tmp_path):
     assert codec("--weights", "cnn", "--config", str(file)) == "3dcsc"
 
 
-@pytest.mark.parametrize("runtime", ["auto", "onnx"])
-def test_weights_of_an_agent_may_be_of_two_kinds_and_no_other(runtime, tmp_path, capsys):
-    file = tmp_path / "notes.txt"
-    file.write_text("buy milk")
-    assert main(["agent", "--source", "0", "--weights", str(file), "--runtime", runtime]) == 1
-    line = f"semcast agent: --weights must be a .safetensors or .onnx file, got {file}\n"
-    assert capsys.readouterr().err == line
-
-
 def test_a_server_without_a_gpu_says_so_at_once(capsys):
     import torch
 

@@ -5,6 +5,7 @@ import shutil
 import pytest
 import torch
 
+from semcast.cli import main
 from semcast.common.codecs import check_codec, codec_of_weights, load_codec, named_weights
 from semcast.common.errors import CheckpointError, ConfigError
 from semcast.training.onnx_export import export_encoder
@@ -103,3 +104,12 @@ def test_what_is_asked_of_a_network_is_told_to_have_no_effect_on_a_conventional_
     load_codec("jpeg-amc", precision="float32", device="cuda", runtime="onnx")
     told = ["device, runtime, precision: no effect on codec jpeg-amc, which has no network"]
     assert [record.getMessage() for record in caplog.records] == told
+
+
+@pytest.mark.parametrize("runtime", ["auto", "onnx"])
+def test_weights_of_an_agent_may_be_of_two_kinds_and_no_other(runtime, tmp_path, capsys):
+    file = tmp_path / "notes.txt"
+    file.write_text("buy milk")
+    assert main(["agent", "--source", "0", "--weights", str(file), "--runtime", runtime]) == 1
+    line = f"semcast agent: --weights must be a .safetensors or .onnx file, got {file}\n"
+    assert capsys.readouterr().err == line
