@@ -1,6 +1,6 @@
 """The trajectory benchmark on drawn scenes: needs no recording, and nothing was tuned on it.
 
-Run by ``make bench-scenes``. About two hours of one core with the default three seeds.
+Run by ``make bench-scenes``. Some hours of one core with the default three seeds.
 """
 
 import argparse

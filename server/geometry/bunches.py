@@ -24,10 +24,14 @@ _NUM_STEPS = 24
 _LEAST_WAITS = 2
 
 
-def in_bunches(intervals_s: ArrayLike) -> bool:
-    """Tell whether any of these intervals, each shared among the frames it has lost, is within a bunch."""
-    intervals = np.asarray(intervals_s, np.float64)
-    return len(intervals) > 1 and bool(intervals.min() < _BUNCH_SHARE * intervals.mean())
+def in_bunches(intervals: ArrayLike) -> bool:
+    """Tell whether any of these times between frames is within a bunch.
+
+    Args:
+        intervals: ``(N,)`` in any unit, each shared among the frames that are missing in it.
+    """
+    times = np.asarray(intervals, np.float64)
+    return len(times) > 1 and bool(times.min() < _BUNCH_SHARE * times.mean())
 
 
 class Bunches:
