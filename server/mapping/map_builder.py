@@ -415,6 +415,7 @@ class MapBuilder:
     def adjust_whole(self) -> int:
         """Adjust all keyframes with all they see, and say how many. Takes seconds where there are many."""
         self.finish()
+        self.watch.conclude()
         if not self._settings.final_adjustment:
             return 0
         num_adjusted = adjust_whole_map(self.world, self._camera, self.noise.model)

@@ -60,6 +60,7 @@ class ReadoutWatch:
         self._axis: Axis | None = None
         self._evidence = PatternEvidence()
         self._found: Readout | None = None
+        self._lens_doubt: str | None = None
         self._lens_is_told = False
         self.forget_frames()
 
@@ -141,15 +142,27 @@ class ReadoutWatch:
         else:
             is_known = num_views >= _ENOUGH_VIEWS and sigma_ms <= _SURE_MS
             self._is_done = is_known or num_views >= _MOST_VIEWS
+        if self._is_done:
+            self.conclude()
 
     def _look_at_lens(self) -> None:
-        """Say once if the lens is clearly another one."""
+        """Say once if the lens is clearly another one, at two looks in a row.
+
+        The first views of a room with bare walls spoke for a focal length 19 % off, by six standard
+        deviations; with eight more, the right one was found.
+        """
         if self._lens_is_told or len(self._evidence) < _LENS_VIEWS:
             return
-        doubt = lens_doubt(self._evidence.views, self._evidence.sigma_factor, self._camera)
-        if doubt is not None:
+        before = self._lens_doubt
+        self._lens_doubt = lens_doubt(self._evidence.views, self._evidence.sigma_factor, self._camera)
+        if before is not None:
+            self.conclude()
+
+    def conclude(self) -> None:
+        """Say of the lens what the last look left in doubt, if there is no other to come."""
+        if self._lens_doubt is not None and not self._lens_is_told:
             self._lens_is_told = True
-            logger.warning("%s, by what is seen: semcast lens measures it", doubt)
+            logger.warning("%s, by what is seen: semcast lens measures it", self._lens_doubt)
 
     def take_found(self) -> Readout | None:
         """Return, once, the readout to be added to what images are put right for; views to come have it."""

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 from shaken_views import CAMERA, adjusted
 
+from semcast.server.mapping import readout_watch
 from semcast.server.mapping.lens_doubt import lens_doubt
+from semcast.server.mapping.readout_watch import ReadoutWatch
 
 
 def doubt(focal=1.0, radial=0.0, centre_px=0.0, noise_px=0.2):
@@ -54,3 +56,33 @@ def test_a_principal_point_is_told_from_distortion():
 def test_views_that_say_nothing_give_no_doubt():
     assert lens_doubt(np.zeros((20, 9, 9)), 1.0, CAMERA) is None
     assert lens_doubt([], 1.0, CAMERA) is None
+
+
+@pytest.mark.parametrize(
+    ("doubts", "told_at"),
+    [([None, "a", None, None], []), ([None, "a", "b", "c"], [2]), ([None, "a", None, "b"], ["end"])],
+)
+def test_a_doubt_is_told_once_where_the_next_look_or_none_confirms_it(doubts, told_at, monkeypatch, caplog):
+    """First views alone may speak for another lens: in a bare room they did."""
+    watch, came = ReadoutWatch(CAMERA, is_wanted=True), iter(doubts)
+    monkeypatch.setattr(readout_watch, "lens_doubt", lambda *_: next(came))
+    monkeypatch.setattr(readout_watch, "fit_readout", lambda *_: None)  # that would end the watch
+    result, told = adjusted(CAMERA), []
+    for look in range(-1, len(doubts)):  # the first has too few views
+        ids = result.problem.keyframe_ids + 100 * look
+        watch.take(replace(result, problem=replace(result.problem, keyframe_ids=ids)))
+        told += [look] * len(caplog.records)
+        caplog.clear()
+    watch.conclude()
+    watch.conclude()
+    assert told + ["end"] * len(caplog.records) == told_at
+
+
+def test_a_doubt_is_told_at_once_where_no_other_look_is_to_come(monkeypatch, caplog):
+    watch = ReadoutWatch(CAMERA, is_wanted=True)
+    monkeypatch.setattr(readout_watch, "lens_doubt", lambda *_: "a")
+    result = adjusted(CAMERA)
+    watch.take(result)
+    watch.take(replace(result, problem=replace(result.problem, keyframe_ids=np.arange(20, 32))))
+    assert not watch.is_on, "24 views know the readout"
+    assert [r.getMessage()[:2] for r in caplog.records] == ["a,"]
