@@ -83,8 +83,8 @@ class Transport:
         np.clip(llr, -_LLR_LIMIT, _LLR_LIMIT, out=llr)
         deinterleaved = np.empty_like(llr)
         deinterleaved[self._order] = llr
-        decoded = ldpc.decode(self._plan, deinterleaved)
-        block = np.packbits(decoded.bits ^ self._scrambler).tobytes()
+        bits = ldpc.decode(self._plan, deinterleaved)
+        block = np.packbits(bits ^ self._scrambler).tobytes()
         (length,) = struct.unpack_from(">I", block)
         if length > self.capacity_bytes:
             return None

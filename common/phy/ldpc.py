@@ -4,8 +4,6 @@ Arrays are laid out ``(column, lifting, block)``: a circulant is then a cyclic s
 one numpy call serves all blocks of an image.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,19 +14,6 @@ from semcast.common.shapes import check_shape
 _SMALLEST, _LARGEST = np.float32(1e-6), np.float32(1.0 - 2.0**-23)
 #: LLR of a filler bit, which is known to be zero.
 _KNOWN_ZERO = np.float32(1e4)
-
-
-@dataclass(frozen=True)
-class DecodedBlocks:
-    """Result of one decoding.
-
-    Attributes:
-        bits: ``(num_info,)`` uint8.
-        iterations: Iterations run until the last block converged or the limit was reached.
-    """
-
-    bits: NDArray[np.uint8]
-    iterations: int
 
 
 def _xor_shifted(target: NDArray[np.uint8], source: NDArray[np.uint8], shift: int) -> None:
@@ -160,13 +145,16 @@ def _failed(belief: NDArray[np.float32], rows: tuple[tuple[tuple[int, int], ...]
     return np.asarray(failed.any(axis=0), dtype=np.bool_)
 
 
-def decode(plan: BlockPlan, llr: NDArray[np.float32], max_iterations: int = 30) -> DecodedBlocks:
+def decode(plan: BlockPlan, llr: NDArray[np.float32], max_iterations: int = 30) -> NDArray[np.uint8]:
     """Decode by layered sum-product, each block until its parity checks hold.
 
     Args:
         plan: The code.
         llr: ``(plan.num_sent,)`` finite LLRs ``ln P(0) / P(1)``, block after block; 0 is an erasure.
         max_iterations: Limit for blocks that don't converge.
+
+    Returns:
+        ``(plan.num_info,)`` bits; of a block that did not converge as far as the last iteration got.
 
     Raises:
         ValueError: The LLRs are of the wrong number or there is no iteration allowed.
@@ -193,7 +181,7 @@ def decode(plan: BlockPlan, llr: NDArray[np.float32], max_iterations: int = 30) 
         active = active[failed]
         belief = np.ascontiguousarray(belief[:, :, failed])
         messages = [np.ascontiguousarray(told[:, :, failed]) for told in messages]
-    return DecodedBlocks(bits=bits.T.reshape(-1), iterations=iteration)
+    return bits.T.reshape(-1)
 
 
 def _channel_belief(plan: BlockPlan, llr: NDArray[np.float32]) -> tuple[NDArray[np.float32], int]:
