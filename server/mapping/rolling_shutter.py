@@ -301,8 +301,9 @@ class RollingShutter:
             return None if values is None else np.asarray(taken_from(values, places), np.float32)
 
         image = np.asarray(taken_from(frame.image, places), np.uint8) if with_colours else frame.image
-        grey = to_grey(image) if with_colours else to_grey(frame.image)
-        grey = grey if with_colours else np.asarray(taken_from(grey, places), np.uint8)
+        grey = to_grey(image)
+        if not with_colours:
+            grey = np.asarray(taken_from(grey, places), np.uint8)
         right = replace(
             frame,
             image=image,
