@@ -26,10 +26,10 @@ ConfidenceMode = Literal["robust", "paper", "off", "constant", "shuffled", "inve
 HUBER_K = 1.345
 #: 99 % quantile of chi-square with two degrees of freedom, as a factor on sigma.
 GATE_SIGMAS = 3.035
-#: Range of beta the fit may give.
-BETA_RANGE = (0.0, 8.0)
-#: And of sigma0.
-SIGMA0_RANGE_PX = (0.25, 6.0)
+#: Largest beta the fit may give,
+_MOST_BETA = 8.0
+#: and the range of its sigma0.
+_SIGMA0_RANGE_PX = (0.25, 6.0)
 #: Residuals that a group of like confidence needs for the fit,
 _MIN_PER_BIN = 12
 #: such groups at most,
@@ -130,12 +130,12 @@ def fit_noise(confidence: Array, residual_px: Array) -> NoiseModel | None:
     misfit = max(1.0, float((precision * scatter**2).sum()) / max(1, bins - 2))
     if slope < _SIGNIFICANCE * np.sqrt(misfit / spread_of_doubt):
         return flat
-    beta = min(slope, BETA_RANGE[1])
+    beta = min(slope, _MOST_BETA)
     return NoiseModel(_clip_sigma0(float(np.exp(0.5 * (mean_log - beta * mean_doubt)))), beta)
 
 
 def _clip_sigma0(sigma0_px: float) -> float:
-    return float(np.clip(sigma0_px, *SIGMA0_RANGE_PX))
+    return float(np.clip(sigma0_px, *_SIGMA0_RANGE_PX))
 
 
 class OnlineNoise:
