@@ -250,17 +250,17 @@ class WorldMap:
             scale: ``(K,)`` factor on lengths around each.
         """
         submap = self.submap_of[int(keyframe_ids[0])]
-        T_before = np.stack([self.poses[k] for k in keyframe_ids.tolist()])
+        T_cam_world = invert_transform(np.stack([self.poses[k] for k in keyframe_ids.tolist()]))
         mine = self.landmarks.submap == submap
         at = _at_or_before(keyframe_ids, self.landmarks.born[mine])
-        around = np.einsum("nij,nj->ni", invert_transform(T_before)[at, :3, :3], self.landmarks.xyz[mine])
-        around = scale[at, None] * (around + invert_transform(T_before)[at, :3, 3])
+        around = np.einsum("nij,nj->ni", T_cam_world[at, :3, :3], self.landmarks.xyz[mine])
+        around = scale[at, None] * (around + T_cam_world[at, :3, 3])
         moved = np.einsum("nij,nj->ni", T_world_cam[at, :3, :3], around) + T_world_cam[at, :3, 3]
         self.landmarks.xyz[mine] = moved
         self._changed.update(self.landmarks.ids[mine].tolist())
         frame_ids = np.array([k for k, s in self.submap_of.items() if s == submap], dtype=np.int64)
         at = _at_or_before(keyframe_ids, frame_ids)
-        T = invert_transform(T_before)[at] @ np.stack([self.poses[k] for k in frame_ids.tolist()])
+        T = T_cam_world[at] @ np.stack([self.poses[k] for k in frame_ids.tolist()])
         T[:, :3, 3] *= scale[at, None]
         self.poses.update(zip(frame_ids.tolist(), T_world_cam[at] @ T, strict=True))
         self._moved_keyframes.update(frame_ids.tolist())
