@@ -16,7 +16,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform
 from semcast.server.geometry.epipolar import fundamental_matrix, sampson_px
 from semcast.server.geometry.triangulation import parallax_deg
-from semcast.server.geometry.weighting import MAD_TO_SIGMA, NoiseModel
+from semcast.server.geometry.weighting import MAD_TO_SIGMA, NoiseModel, fuse_confidence
 from semcast.server.mapping.observations import gather_observations
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
@@ -107,6 +107,6 @@ def _misfit(camera: Intrinsics, noise: NoiseModel, before: Keyframe, newest: Key
         return 1.0
     row0, row1 = (np.searchsorted(k.ids, shared) for k in (before, newest))
     F = fundamental_matrix(camera, invert_transform(newest.T_world_cam) @ before.T_world_cam)
-    sigma = noise.sigma_px(np.minimum(before.confidence[row0], newest.confidence[row1]))
+    sigma = noise.sigma_px(fuse_confidence(before.confidence[row0], newest.confidence[row1]))
     size = np.abs(sampson_px(F, before.xy[row0], newest.xy[row1])) / sigma
     return max(1.0, MAD_TO_SIGMA * float(np.median(np.nan_to_num(size))))
