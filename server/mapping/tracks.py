@@ -50,6 +50,8 @@ _MIN_FOUND_SHARE = 0.35
 _PLENTY_OF_MATCHES = 80
 #: A track this far from where descriptors lead to has found something else.
 _REFUTED_PX = 3.0
+#: Side of the cells that tell which tracks are beside a point.
+_BESIDE_PX = 4.0
 #: What a track has, by attribute of ``TrackTable``.
 _MOTION = ("ids", "xy", "velocity", "confidence", "variance_px2", "drift_px2", "age", "missed")
 _COLUMNS = (*_MOTION, "anchor_xy", "stood_widths", "edge")
@@ -371,11 +373,11 @@ class TrackTable:
             variance_px2 = np.where(np.isfinite(scatter_px2), scatter_px2, expected)
             self.confidence[rows] = variance_confidence(variance_px2)
 
-    def beside(self, xy: Array, cell_px: float = 4.0) -> NDArray[np.bool_]:
+    def beside(self, xy: Array) -> NDArray[np.bool_]:
         """Visible tracks next to ``(M, 2)`` points, ``(N,)``: in the same or a neighbouring cell."""
         around = np.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1)])
-        taken = (np.floor(xy / cell_px).astype(np.int64)[:, None] + around).reshape(-1, 2)
-        cells = np.floor(self.xy / cell_px).astype(np.int64)
+        taken = (np.floor(xy / _BESIDE_PX).astype(np.int64)[:, None] + around).reshape(-1, 2)
+        cells = np.floor(self.xy / _BESIDE_PX).astype(np.int64)
         return self.visible & np.isin(cell_keys(cells), cell_keys(taken))
 
     def bring_back(self, sight: Sight, ids: Ids, points: TrackedPoints) -> Ids:
