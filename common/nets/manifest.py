@@ -10,6 +10,8 @@ from typing import Any
 from semcast.common.errors import CheckpointError
 from semcast.common.whole_file import write_whole
 
+#: Where shipped weights lie, with their manifests and the exported encoders of some.
+SHIPPED_FOLDER = Path(__file__).resolve().parent.parent / "weights"
 #: Raised when keys of the manifest change, or when the same weights mean another network (2: leaky units;
 #: 3: told how well values arrive, not how they travel).
 FORMAT = 3
@@ -73,10 +75,9 @@ def weights_path(name_or_path: str | Path) -> Path:
             f"{path} is an exported encoder, which can only send: give the .safetensors file it is of, "
             "or runtime onnx to an agent"
         )
-    folder = Path(__file__).resolve().parent.parent / "weights"
-    shipped = folder / f"{name_or_path}.safetensors"
+    shipped = SHIPPED_FOLDER / f"{name_or_path}.safetensors"
     if not shipped.is_file():
-        known = sorted(p.stem for p in folder.glob("*.safetensors"))
+        known = sorted(p.stem for p in SHIPPED_FOLDER.glob("*.safetensors"))
         if path.is_file():
             raise CheckpointError(f"weights must be a .safetensors file, got {path}")
         raise CheckpointError(

@@ -15,6 +15,7 @@ from semcast.common.errors import CheckpointError, ConfigError
 from semcast.common.nets.coder_input import coder_input
 from semcast.common.nets.detail import allocation_for
 from semcast.common.nets.latent import symbols_from_latent
+from semcast.common.nets.manifest import SHIPPED_FOLDER
 from semcast.common.nets.modulation_numpy import transmit
 from semcast.common.nets.rounding import rounded_snr_db
 
@@ -49,8 +50,7 @@ def encoder_path(name_or_path: str | Path) -> Path:
     elif path.suffix == SUFFIX and not path.is_file():
         raise CheckpointError(f"there is no exported encoder {path}")
     elif path.suffix != SUFFIX:
-        folder = Path(__file__).resolve().parent.parent / "weights"
-        path = folder / f"{name_or_path}{SUFFIX}"
+        path = SHIPPED_FOLDER / f"{name_or_path}{SUFFIX}"
         if not path.is_file():
             raise CheckpointError(
                 f"no exported encoder {path.name}; write one with 'semcast onnx' where torch is installed"
