@@ -135,18 +135,18 @@ def _spread(rows: Tensor, side: int) -> Tensor:
     return grid.reshape(height * side, width * side, channels // (side * side))
 
 
-def _fold_order(channels: int) -> Tensor:
-    """Return, for each channel of ``_gather`` by 4, the same value's channel of ``PixelUnshuffle(4)``."""
-    return _order(channels, _FOLD, lambda rows: _gather(rows, _FOLD))
+def _fold_order() -> Tensor:
+    """Return, for each channel of RGB gathered by 4, the same value's channel of ``PixelUnshuffle(4)``."""
+    return _order(_FOLD, lambda rows: _gather(rows, _FOLD))
 
 
 def _block_order() -> Tensor:
     """Return the same for 16x16 RGB blocks gathered by 4 and by 4 again."""
-    return _order(3, _FOLD * _GROUPS, lambda rows: _gather(_gather(rows, _FOLD), _GROUPS))
+    return _order(_FOLD * _GROUPS, lambda rows: _gather(_gather(rows, _FOLD), _GROUPS))
 
 
-def _order(channels: int, side: int, gather: Callable[[Tensor], Tensor]) -> Tensor:
-    picture = torch.arange(channels * side * side).view(channels, side, side)
+def _order(side: int, gather: Callable[[Tensor], Tensor]) -> Tensor:
+    picture = torch.arange(3 * side * side).view(3, side, side)
     # PixelUnshuffle of this picture counts 0, 1, 2, ... through its channels.
     return gather(picture.permute(1, 2, 0)).reshape(-1)
 
@@ -241,7 +241,7 @@ class _ArrangedEncoder:
         self._dtype = exact = _of_values(dtype)
         # Pixels enter as value - 127.5, which bfloat16 holds exactly; 1/255 is in the weights.
         scale = 1.0 / 255.0
-        self._stem = _Conv(encoder.stem, dtype, inputs=_fold_order(3), scale=scale)
+        self._stem = _Conv(encoder.stem, dtype, inputs=_fold_order(), scale=scale)
         self._down8, self._down16 = _Conv(encoder.down8, dtype), _Conv(encoder.down16, dtype)
         self._stages = [_Stage(s, dtype) for s in (encoder.stage4, encoder.stage8, encoder.stage16)]
         self._head = _Conv(encoder.head, exact)
@@ -270,7 +270,7 @@ class _ArrangedDecoder:
 
     def __init__(self, decoder: Decoder, branch: ConfidenceBranch, dtype: torch.dtype) -> None:
         self._dtype = exact = _of_values(dtype)
-        order = _fold_order(3)
+        order = _fold_order()
         self._linear: BlockSynthesis = decoder.linear
         self._unmix = _Conv(decoder.linear.unmix, exact)
         self._transform = _Conv(decoder.linear.transform, exact, outputs=_block_order())
