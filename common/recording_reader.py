@@ -30,7 +30,7 @@ DAMAGE_METADATA = "semcast.damage"
 FORMAT = "1"
 MAX_RECORD_BYTES = 256 * 1024**2
 
-_HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 0x01, 0x02, 0x03, 0x04, 0x05, 0x06, 0x0F
+_FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 0x02, 0x03, 0x04, 0x05, 0x06, 0x0F
 _METADATA = 0x0C
 _FRAME = struct.Struct("<BQ")
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
@@ -167,7 +167,7 @@ class RecordingScan:
             while True:
                 opcode, size = _FRAME.unpack(self._exactly(_FRAME.size))
                 if opcode in (_FOOTER, _DATA_END):
-                    self.complete = opcode == _DATA_END or self.complete
+                    self.complete = opcode == _DATA_END
                     return
                 if opcode == _CHUNK:
                     yield from self._chunk(size)
