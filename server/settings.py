@@ -48,6 +48,7 @@ class ServerSettings:
             file of weights takes the place of the shipped ones of its codec.
         modulation: Of that codec.
         threads: CPU threads of the decoder.
+        precision: What a learned decoder computes in.
         device: Where the decoder runs.
         reference: The recorded sequence the agent sends, for PSNR and true path.
         camera: Of the reference, where it does not say it or the agent uses another.

@@ -31,7 +31,6 @@ class BaseGraph:
         rows: Per base row, its ``(column, shift)`` edges in ascending column order.
         lifting: Size of each circulant.
         num_info_columns: Columns that carry information and filler bits.
-        num_columns: All columns.
     """
 
     rows: tuple[tuple[tuple[int, int], ...], ...]

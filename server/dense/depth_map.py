@@ -26,8 +26,9 @@ _MIN_PATCH_PX = 40
 _MAX_APART = 1.5
 #: Parts of a step that patches are told apart by.
 _PARTS = 16
-#: Share of the pixels (every 8th each way) whose movement tells how many depths are tried.
-_MOST = 90.0
+#: How many depths are tried follows the movement that so many percent of the pixels stay below,
+_MOST_PERCENT = 90.0
+#: looked at in one row and column of so many.
 _GRID_PX = 8
 
 
@@ -120,7 +121,7 @@ def _num_depths(problem: DepthProblem) -> int:
         inside = ((near >= 0.0) & (near < np.array([[width], [height]]))).all(axis=0)
         distance = np.linalg.norm(near - far, axis=0)[inside]
         if len(distance):
-            moved = max(moved, float(np.percentile(distance, _MOST)))
+            moved = max(moved, float(np.percentile(distance, _MOST_PERCENT)))
     return int(np.clip(np.ceil(moved), MIN_DEPTHS, MAX_DEPTHS))
 
 

@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 #: Poses and points.
 _Solved = tuple[Array, Array]
 
-#: Observations share noise models: their sigmas are rounded to this many steps.
+#: Observations share noise models: their sigmas are rounded to this many steps
 NUM_SIGMAS = 16
 #: in equal ratios within this range.
 SIGMA_RANGE_PX = (0.1, 12.0)
