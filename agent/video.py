@@ -2,6 +2,7 @@
 
 import contextlib
 import logging
+import math
 import os
 import re
 import sys
@@ -215,15 +216,22 @@ class VideoSource(_Captured):
     def _one_pass(self) -> Iterator[tuple[int, NDArray[np.uint8]]]:
         """Yield what is left in the file, each image with its time in ns since the first one."""
         image, self._first = self._first, None
+        image, stamp_ms = self._next() if image is None else (image, self._stamp_ms())
         times = VideoTimes(self._fps)
-        while self._capture is not None:
-            if image is None:
-                image = _read(self._capture)
-            if image is None:
-                self._warn_if_cut(times)
-                return
-            yield times.next_ns(float(self._capture.get(cv2.CAP_PROP_POS_MSEC))), image
-            image = None
+        while image is not None and self._capture is not None:
+            following, following_ms = self._next()
+            yield times.next_ns(stamp_ms, following_ms), image
+            image, stamp_ms = following, following_ms
+        if self._capture is not None:
+            self._warn_if_cut(times)
+
+    def _next(self) -> tuple[NDArray[np.uint8] | None, float]:
+        """Return the next image in the file and its stamp in ms; None and no number at the end."""
+        image = _read(self._capture) if self._capture is not None else None
+        return image, math.nan if image is None else self._stamp_ms()
+
+    def _stamp_ms(self) -> float:
+        return math.nan if self._capture is None else float(self._capture.get(cv2.CAP_PROP_POS_MSEC))
 
     def _warn_if_cut(self, times: VideoTimes) -> None:
         """Say once that a good deal fewer frames could be read than the file has: a sign of damage."""

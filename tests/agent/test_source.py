@@ -282,6 +282,15 @@ def test_a_video_of_varying_rate_keeps_its_times_over_all_passes(video, uneven_v
     assert [f.t_source_ns for f in frames] == [20_000_000 * k for k in range(30)]
 
 
+def test_one_wrong_stamp_of_a_video_holds_up_no_frame(uneven_video, tmp_path):
+    data, wrong = uneven_video.read_bytes(), tmp_path / "wrong.mkv"
+    third, far = (b"\x81" + (40 * n).to_bytes(2, "big") + b"\x80" for n in (2, 800))
+    wrong.write_bytes(data.replace(third, far))
+    frames, expected = (play(fast(path, camera=PINHOLE))[1] for path in (wrong, uneven_video))
+    times_ms, expected_ms = ([f.t_source_ns / 1e6 for f in of] for of in (frames, expected))
+    np.testing.assert_allclose(times_ms, expected_ms, atol=1.0)
+
+
 def test_a_damaged_video_says_how_much_of_it_can_be_read(tmp_path, caplog):
     whole, cut = tmp_path / "whole.avi", tmp_path / "cut.avi"
     writer = cv2.VideoWriter(str(whole), cv2.VideoWriter_fourcc(*"MJPG"), 25.0, (64, 48))

@@ -19,6 +19,27 @@ from semcast.agent.video_times import VideoTimes
 def test_times_of_a_video_are_its_own_where_it_has_some(stamps_ms, times_ms):
     times = VideoTimes(50.0)
     assert [times.next_ns(stamp_ms) for stamp_ms in stamps_ms] == [1_000_000 * t for t in times_ms]
+    assert times_in_ms(stamps_ms) == times_ms, "known a frame ahead, they are no others"
+
+
+def times_in_ms(stamps_ms):
+    times = VideoTimes(50.0)
+    return [times.next_ns(*both) / 1e6 for both in zip(stamps_ms, [*stamps_ms[1:], np.nan], strict=True)]
+
+
+@pytest.mark.parametrize("wrong_ms", [85, 300, 1e8])
+@pytest.mark.parametrize("at", [1, 2, 6])
+def test_a_single_stamp_that_is_far_ahead_is_wrong(at, wrong_ms):
+    regular = [20 * k for k in range(10)]
+    assert times_in_ms([*regular[:at], regular[at] + wrong_ms, *regular[at + 1 :]]) == regular
+    uneven = [0, 30, 45, 60, 90, 100, 125, 140, 150, 170]
+    got = times_in_ms([*uneven[:at], uneven[at] + wrong_ms, *uneven[at + 1 :]])
+    assert got == [*uneven[:at], uneven[at - 1] + 20, *uneven[at + 1 :]]
+
+
+def test_after_several_that_are_far_ahead_frames_come_at_the_usual_rate():
+    stamps_ms = [0, 20, 5000, 5040, *(20 * k for k in range(4, 200))]
+    assert times_in_ms(stamps_ms) == [0, 20, *(5000, 5040), *(5040 + 20 * k for k in range(1, 197))]
 
 
 @pytest.mark.parametrize(
