@@ -47,6 +47,7 @@ Recorded sequences and recordings
     sequence_layouts        the folder layouts it is read from
     colmap_file             cameras and poses of a COLMAP model
     sequence_sizes          sizes of its image files
+    image_order             the order of images by their names
     numbered_images         lines of a file, matched with images
     text_rows               lines of fields, without comments
     transforms_file         transforms.json

@@ -4,7 +4,6 @@ Images are not opened here. Poses are brought to ``T_world_cam`` of the camera w
 """
 
 import logging
-import re
 import shlex
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ from semcast.common.camera_file import read_flat_yaml, read_intrinsics, transfor
 from semcast.common.colmap_file import colmap_folder, half_a_model, read_colmap
 from semcast.common.errors import SourceError
 from semcast.common.geometry import make_transform, project_to_so3, rotation_from_quat_wxyz
+from semcast.common.image_order import in_order, natural_key
 from semcast.common.numbered_images import lines_of_images, numbers_in_names
 from semcast.common.ros_bag_files import check_no_ros_bag
 from semcast.common.text_rows import text_rows
@@ -66,13 +66,6 @@ class SequenceFiles:
     times_ns: NDArray[np.int64]
     camera: Callable[[int, int], Intrinsics | None]
     groundtruth: Trajectory | None
-
-
-def natural_key(name: str) -> list[tuple[int, int | str]]:
-    """Sort key by which ``r_2`` comes before ``r_10``."""
-    parts = re.split(r"([0-9]+)", name)
-    # Every second part is what the pattern caught; isdigit would also take signs that int can't read.
-    return [(0, int(part)) if k % 2 else (1, part) for k, part in enumerate(parts) if part]
 
 
 #: The year 2255; nanoseconds beyond 2262 are no 64-bit number.
@@ -209,7 +202,7 @@ def _check_there(path: Path) -> None:
 
 
 def images_in(folder: Path) -> tuple[Path, ...]:
-    """Return the image files of a folder in the natural order of their names; nothing is read from a pipe.
+    """Return the image files of a folder, ``in_order`` of their names; nothing is read from a pipe.
 
     Raises:
         SourceError: The folder can't be read.
@@ -222,7 +215,7 @@ def images_in(folder: Path) -> tuple[Path, ...]:
         ]
     except OSError as err:
         raise SourceError(f"{folder} can't be read: {err}") from err
-    return tuple(sorted(found, key=lambda p: natural_key(p.name)))
+    return in_order(found)
 
 
 def _nominal_times_ns(count: int, rate_hz: float) -> NDArray[np.int64]:

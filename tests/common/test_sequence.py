@@ -10,7 +10,6 @@ from semcast.common.camera_settings import CameraSettings
 from semcast.common.errors import SourceError
 from semcast.common.geometry import exp_so3
 from semcast.common.sequence import open_sequence, retimed
-from semcast.common.sequence_layouts import natural_key
 from semcast.common.trajectory import Trajectory, write_tum
 
 CAMERA = Intrinsics(fx=30.0, fy=31.0, cx=15.5, cy=11.5, width=32, height=24)
@@ -163,14 +162,6 @@ def test_times_beside_the_images_of_a_folder_are_read(tmp_path, write_images):
     write_images(tmp_path, 3, "img{:d}.png")
     (tmp_path / "times.txt").write_text("0.5\n0.75\n2\n")
     np.testing.assert_array_equal(open_sequence(tmp_path).times_ns, [500_000_000, 750_000_000, 2_000_000_000])
-
-
-def test_names_with_signs_that_are_no_digits_of_a_number_are_sorted(tmp_path):
-    names = ["a10.png", "a2.png", "a²3.png", "²1.png", "٣.png"]
-    assert sorted(names, key=natural_key) == ["a2.png", "a10.png", "a²3.png", "²1.png", "٣.png"]
-    for name in names:
-        cv2.imwrite(str(tmp_path / name), np.zeros((24, 32, 3), np.uint8))
-    assert len(open_sequence(tmp_path)) == 5
 
 
 @pytest.mark.parametrize("layout", ["auto", "native"])
