@@ -40,14 +40,15 @@ def coded_shape(shape_hw: tuple[int, int], rate: Rate) -> tuple[int, int]:
     """Return the height and width in pixels at which an image is coded.
 
     Away from the native rate both are whole blocks, and their channel uses are never above the rate's unless
-    the image is smaller than two blocks by two.
+    that is less than two blocks by two.
     """
     if rate == NATIVE_RATE:
         return shape_hw
     height, width = shape_hw
     scale = math.sqrt(uses_per_value(rate) / uses_per_value(NATIVE_RATE))
-    rows = max(2, round(height * scale / BLOCK_PX))
     budget = height * width * 3 * uses_per_value(rate) / USES_PER_BLOCK
+    # Of a narrow image fewer: columns are two at least.
+    rows = max(2, min(round(height * scale / BLOCK_PX), math.floor(budget / 2)))
     return rows * BLOCK_PX, max(2, math.floor(budget / rows)) * BLOCK_PX
 
 

@@ -44,6 +44,14 @@ def test_no_more_uses_than_the_rate_allows_and_hardly_fewer(shape_hw, rate):
     assert belongs_to(coded, shape_hw)
 
 
+@pytest.mark.parametrize("rate", [rate for rate in RATES if rate != "1/16"])
+def test_of_small_and_narrow_images_no_rate_is_exceeded_either(rate):
+    for short, long in np.random.default_rng(0).integers((16, 16), (64, 700), (300, 2)).tolist():
+        for shape_hw in ((short, long), (long, short)):
+            allowed = short * long * 3 * uses_per_value(rate)
+            assert layout_for(coded_shape(shape_hw, rate)).num_uses <= max(allowed, 4 * 48), shape_hw
+
+
 def test_an_image_is_made_smaller_by_averaging_and_at_the_native_rate_it_stays():
     noise = np.random.default_rng(0).integers(0, 256, (96, 96, 3)).astype(np.uint8)
     assert to_coded(noise, NATIVE_RATE) is noise
