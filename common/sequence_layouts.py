@@ -19,7 +19,7 @@ from semcast.common.camera_file import read_flat_yaml, read_intrinsics, transfor
 from semcast.common.colmap_file import colmap_folder, half_a_model, read_colmap
 from semcast.common.errors import SourceError
 from semcast.common.geometry import make_transform, project_to_so3, rotation_from_quat_wxyz
-from semcast.common.image_order import in_order, natural_key
+from semcast.common.image_order import in_order, order_of
 from semcast.common.numbered_images import lines_of_images, numbers_in_names
 from semcast.common.ros_bag_files import check_no_ros_bag
 from semcast.common.text_rows import text_rows
@@ -458,7 +458,7 @@ def _read_transforms(path: Path, rate_hz: float) -> SequenceFiles:
         if found is None:
             raise SourceError(f"{path} has no transforms.json, transforms_test.json or transforms_train.json")
         path = found
-    file = read_transforms_json(path, IMAGE_SUFFIXES, natural_key)
+    file = read_transforms_json(path, IMAGE_SUFFIXES)
     times_ns = _nominal_times_ns(len(file.image_paths), rate_hz)
     truth = Trajectory(ns_to_seconds(times_ns), file.T_world_cam, in_metres=False)
     return SequenceFiles(path.resolve().parent.name, file.image_paths, times_ns, file.camera, truth)
@@ -470,7 +470,7 @@ def _read_colmap(path: Path, rate_hz: float) -> SequenceFiles:
     if folder is None:
         raise SourceError(f"{path} must have sparse/0/cameras.bin and images.bin, or .txt, of COLMAP")
     model = read_colmap(folder)
-    order = sorted(range(len(model.names)), key=lambda k: natural_key(model.names[k]))
+    order = order_of(model.names)
     num_there = len(images_in(path / "images"))
     if num_there > len(order):
         logger.info(

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import SourceError
 from semcast.common.geometry import T_opencv_opengl, project_to_so3
+from semcast.common.image_order import order_of
 from semcast.common.lens import check_one_camera, lens_in
 
 #: Models that undistortion turns into a pinhole; nerfstudio's others are panoramas and the like.
@@ -28,7 +29,7 @@ class TransformsFile:
     """What a ``transforms.json`` holds.
 
     Attributes:
-        image_paths: One per frame, in the natural order of their names; a name without suffix is a ``.png``.
+        image_paths: One per frame, in the order of their names; a name without suffix is a ``.png``.
         T_world_cam: ``(N, 4, 4)``, camera axes x right, y down, z forward.
         camera: Returns the intrinsics of images of a given width and height, None where the file has none.
     """
@@ -38,22 +39,20 @@ class TransformsFile:
     camera: Callable[[int, int], Intrinsics | None]
 
 
-def read_transforms_json(
-    path: Path, suffixes: tuple[str, ...], order: Callable[[str], Any]
-) -> TransformsFile:
+def read_transforms_json(path: Path, suffixes: tuple[str, ...]) -> TransformsFile:
     """Read the file.
 
     Args:
         path: The file.
         suffixes: Of images, lower case.
-        order: Sort key of the frames' names.
 
     Raises:
         SourceError: It can't be read, a matrix is none, or the frames are of several cameras.
     """
     try:
         document = json.loads(path.read_text(encoding="utf-8-sig"))
-        frames = sorted(document["frames"], key=lambda f: order(str(f["file_path"])))
+        found = list(document["frames"])
+        frames = [found[k] for k in order_of([str(frame["file_path"]) for frame in found])]
         images = tuple(_image(path.parent, str(frame["file_path"]), suffixes) for frame in frames)
         T_world_gl = _matrices(frames)
         _check_frames(document, frames)

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from semcast.common.image_order import in_order, natural_key
+from semcast.common.image_order import in_order, natural_key, order_of
 from semcast.common.sequence import open_sequence
 from semcast.common.sequence_layouts import images_in
 
@@ -25,6 +25,8 @@ def test_names_that_are_times_without_the_zeros_at_their_end_are_in_order_of_tim
     for name in names:
         (tmp_path / name).touch()
     assert [path.name for path in images_in(tmp_path)] == names
+    in_folder = [f"./train/{name.removesuffix('.jpg')}" for name in names]
+    assert order_of(in_folder[::-1]) == list(range(99, -1, -1)), "as other files name them"
 
 
 @pytest.mark.parametrize(
