@@ -101,8 +101,10 @@ def as_rgb(raw: NDArray, *, is_on_black: bool = False) -> NDArray[np.uint8]:
         is_on_black: Colours are multiplied by alpha.
 
     Raises:
-        SourceError: The values are neither those of 0..1 nor of 0..255, nor 16-bit.
+        SourceError: The values are neither those of 0..1 nor of 0..255, nor 16-bit, or there are two a pixel.
     """
+    if raw.ndim == 3 and raw.shape[2] not in (1, 3, 4):
+        raise SourceError(f"images must have 1, 3 or 4 values a pixel, got {raw.shape[2]}")
     raw = _as_bytes(raw)
     if raw.ndim == 2 or raw.shape[2] == 1:
         return np.asarray(cv2.cvtColor(raw, cv2.COLOR_GRAY2RGB), dtype=np.uint8)

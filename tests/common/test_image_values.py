@@ -104,3 +104,10 @@ def test_sides_beyond_all_limits_are_damage_of_that_image_alone(tmp_path, suffix
     assert [sequence.image(k).max() for k in (0, 2)] == [90, 90]
     with pytest.raises(SourceError, match=f"1{suffix} is not a readable image"):
         sequence.image(1)
+
+
+def test_an_image_of_two_values_a_pixel_is_refused_alone(tmp_path):
+    header = b"P7\nWIDTH 3\nHEIGHT 2\nDEPTH 2\nMAXVAL 255\nTUPLTYPE GRAYSCALE_ALPHA\nENDHDR\n"
+    (tmp_path / "grey.ppm").write_bytes(header + bytes(range(12)))
+    with pytest.raises(SourceError, match=r"grey.ppm: images must have 1, 3 or 4 values a pixel, got 2"):
+        read_image(tmp_path / "grey.ppm")
