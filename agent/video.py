@@ -75,6 +75,10 @@ def open_capture(source: str, *, live: bool) -> cv2.VideoCapture:
     Raises:
         SourceError: It is a picture, or can't be opened; one at an address is waited for for five seconds.
     """
+    try:
+        source.encode()
+    except UnicodeEncodeError as err:  # OpenCV ends the process
+        raise SourceError(f"the name of {public_name(source)!r} must be text in UTF-8") from err
     if not live:
         if Path(source).suffix.lower() in IMAGE_SUFFIXES:  # OpenCV would take it for a video
             raise SourceError(f"{source} is a single picture: give the folder of pictures that it is in")

@@ -1,4 +1,5 @@
 import shutil
+import subprocess
 import sys
 import threading
 import time
@@ -331,6 +332,20 @@ def test_a_video_needs_a_camera_that_fits(video, tmp_path):
     (tmp_path / "steps.json").write_text('{"title": "a film"}')
     with pytest.raises(SourceError, match="steps.json: intrinsics need .*, missing 'fx'"):
         open_source(fast(beside))
+
+
+@pytest.mark.parametrize("name", [b"film\xe9.avi", b"/dev/video\xe9", b"rtsp://me:secret@host/\xe9"])
+def test_a_name_that_is_no_text_is_refused_and_does_not_end_the_process(name):
+    code = "import sys; from semcast.agent.video import open_capture; open_capture(sys.argv[1], live={})"
+    done = subprocess.run(
+        [sys.executable, "-c", code.format(b"avi" not in name), name],
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 1, "as of an exception"
+    assert "must be text in UTF-8" in done.stderr
+    assert "secret" not in done.stderr.splitlines()[-1]
 
 
 def test_what_can_not_be_opened_is_said(tmp_path):
