@@ -220,7 +220,9 @@ def place_by_marker(
         )
     sightings = Sightings(dictionary)
     for frame_id, path in posed.items():
-        grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        # OpenCV would end the process where a name is no text.
+        file = np.fromfile(path, dtype=np.uint8) if path.is_file() else np.empty(0, dtype=np.uint8)
+        grey = cv2.imdecode(file, cv2.IMREAD_GRAYSCALE) if file.size else None
         if grey is None or grey.shape != data.intrinsics.shape_hw:
             raise SourceError(f"{path} must be an image of {data.intrinsics.width}x{data.intrinsics.height}")
         sightings.look(frame_id, np.asarray(grey, dtype=np.uint8))

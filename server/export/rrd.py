@@ -4,10 +4,11 @@ import shutil
 from collections.abc import Mapping
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from semcast.common.errors import SemcastError, SourceError
+from semcast.common.image_file import read_image
+from semcast.common.message_fields import sendable
 from semcast.common.run_folder import VIEWER_NAME, RunData
 from semcast.common.whole_file import whole_file
 from semcast.server.view.frame_view import FrameView
@@ -48,13 +49,13 @@ def write_rrd(
     with whole_file(path) as file:
         try:
             stream = RerunStream(
-                recording_id=folder.name or "run",
+                recording_id=sendable(folder.name, 200) or "run",
                 camera=data.intrinsics,
                 has_truth=False,
                 has_confidence=False,
                 file=Path(file.name),
             )
-        except RuntimeError as err:
+        except (RuntimeError, UnicodeEncodeError) as err:  # a name may be no text
             raise SemcastError(f"{path} can't be written: {err}") from err
         try:
             _show(stream, data, images)
@@ -88,10 +89,10 @@ def _view(
 ) -> FrameView:
     image = None
     if path is not None:
-        bgr = cv2.imread(str(path))
-        if bgr is None:
-            raise SourceError(f"{path} can't be read as an image")
-        image = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+        try:
+            image = read_image(path)
+        except SourceError as err:
+            raise SourceError(f"{path} can't be read as an image") from err
     xy = data.observed_xy[data.observed_keyframe_ids == frame_id]
     return FrameView(
         frame_id=frame_id,

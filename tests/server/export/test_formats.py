@@ -1,6 +1,7 @@
 """Every export is read back by the tool it is for, or by a parser written from that tool's specification."""
 
 import json
+import os
 from dataclasses import replace
 
 import cv2
@@ -274,6 +275,18 @@ def test_without_one_a_rerun_recording_is_made_of_poses_images_and_points(tmp_pa
         str(chunk.entity_path): 0 for chunk in rr.chunk.RrdReader(tmp_path / "made.rrd").stream().to_chunks()
     }
     assert {"/world/camera", "/world/camera/image", "/world/map_colour/0000"} <= set(entities)
+
+
+def test_a_rerun_recording_is_made_of_a_run_whose_folder_has_no_name_in_text(
+    tmp_path, arc_run, write_arc_run
+):
+    folder = tmp_path / os.fsdecode(b"run\xff")
+    write_arc_run(folder, arc_run())
+    export_run(folder, "rrd", tmp_path / "made.rrd")
+    assert (tmp_path / "made.rrd").stat().st_size > 0
+    with pytest.raises(SemcastError, match=r"made.rrd can't be written: .* surrogates not allowed"):
+        export_run(folder, "rrd", folder / "made.rrd")
+    assert not (folder / "made.rrd").exists()
 
 
 def test_a_rerun_recording_that_is_made_is_looked_at_from_a_distance_of_the_maps_size(

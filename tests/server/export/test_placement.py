@@ -1,6 +1,7 @@
 """Runs brought to metres: by a known path, by a marker in the pictures."""
 
 import json
+import os
 import re
 from dataclasses import replace
 
@@ -181,6 +182,13 @@ def test_a_marker_gives_metres_and_its_own_axes(marker_run):
     assert rotation_angle_deg(placement.R @ T_MAP_MARKER[:3, :3]) < 0.3
     assert placement.frame == "x right, y up, z out of marker 7; metres"
     assert placement.words.startswith("marker 7: 12 images, 0.")
+
+
+def test_a_marker_is_found_in_images_of_a_folder_whose_name_is_no_text(marker_run, tmp_path):
+    data, _ = marker_run()
+    folder = (tmp_path / "run").rename(tmp_path / os.fsdecode(b"run\xff"))
+    placement = place_by_marker(data, read_image_paths(folder), SIDE * SCALE, FAMILY)
+    assert placement.scale == pytest.approx(SCALE, rel=3e-3)
 
 
 def test_the_stated_uncertainty_covers_the_error_and_is_not_idle(marker_run):
