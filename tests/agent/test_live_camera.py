@@ -179,6 +179,28 @@ def test_a_rate_that_a_camera_has_no_whole_part_of_is_kept_on_the_whole(monkeypa
     assert 40 / ((times_ns[-1] - times_ns[0]) * 1e-9) == pytest.approx(20.0, rel=0.03)
 
 
+@pytest.mark.parametrize(
+    ("given_hz", "wanted_hz", "one_in"), [(29.97, 30.0, 1), (30.0, 15.0, 2), (30.0, 10.0, 3)]
+)
+def test_a_camera_that_is_not_steady_gives_images_as_regularly_as_it_can(
+    monkeypatch, given_hz, wanted_hz, one_in
+):
+    rng, clock = np.random.default_rng(0), SimpleNamespace(ns=10**9, count=0)
+
+    class Unsteady(Driver):
+        def read(self):
+            clock.count += 1
+            clock.ns = 10**9 + round((clock.count / given_hz + rng.uniform(0.0, 0.002)) * 1e9)
+            return True, np.zeros((48, 64, 3), np.uint8)
+
+    now = SimpleNamespace(monotonic=lambda: clock.ns * 1e-9, monotonic_ns=lambda: clock.ns)
+    monkeypatch.setattr("semcast.agent.video.time", now)
+    monkeypatch.setattr(cv2, "VideoCapture", Unsteady)
+    settings = SourceSettings(source="99", camera=PINHOLE, max_frames=400, pace="rate", rate_hz=wanted_hz)
+    frames = list(open_source(settings).frames(threading.Event()))
+    assert set(np.diff([frame.frame_id for frame in frames])) == {one_in}
+
+
 def test_images_that_waited_before_the_start_are_thrown_away(make_camera):
     camera = make_camera(40, 8, 0.1)
     source = open_source(SourceSettings(source=camera.address, camera=PINHOLE, max_frames=1))
