@@ -19,7 +19,7 @@ from semcast.server.geometry.pnp import reprojection_residual, search_pose
 from semcast.server.geometry.weighting import GATE_SIGMAS, NoiseModel
 from semcast.server.mapping.pose_graph import PoseConstraint, SolvedGraph, solve_graph
 from semcast.server.mapping.relocalisation import MAX_CONSIDERED, Place, Relocaliser, submap_similarity
-from semcast.server.mapping.revisit import OLD_SIGMA_PX, Revisit, tells_depth
+from semcast.server.mapping.revisit import OLD_SIGMA_PX, Revisit, off_lines_px, tells_depth
 from semcast.server.mapping.scene_depth import median_depth
 from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.steps import steps_of, usable_depth
@@ -49,12 +49,11 @@ _SAME_SCALE = 1.15
 _MIN_FOUND = 20
 #: The same as a share of those found.
 _MIN_FOUND_SHARE = 0.6
-#: Standard deviations of a recognised place: rotation in radians,
-_PLACE_RAD = 0.004
-#: translation in median depths,
-_PLACE_DEPTH = 0.02
-#: and logarithm of the scale.
-_PLACE_SCALE = 0.03
+#: Standard deviations of a recognised place: rotation in radians, translation in median depths, and logarithm
+#: of the scale. Landmarks of there are to be found in the newest image where the graph puts the camera.
+_PLACE_SIGMA = (0.001, 0.004, 0.01)
+#: The same of places that were recognised before: the way in between has been adjusted since.
+_FORMER_SIGMA = (0.004, 0.02, 0.03)
 #: Half the squared error in standard deviations that a loop may leave: seven errors of five deviations. What
 #: takes more is no drift but a wrong place: landmarks of poor depth may be agreed with from 30 degrees off.
 _MAX_COST = 0.5 * 7 * 5.0**2
@@ -126,6 +125,7 @@ class LoopFinder:
         self._pending: Loop | None = None
         self._since_pending = self._since_look = 0
         self._settled = self._refused = 0
+        self._tied_id = -1
 
     @property
     def is_in_doubt(self) -> bool:
@@ -153,10 +153,16 @@ class LoopFinder:
         self._refused -= 1
         if self._since_pending > _MAX_PENDING:
             self._pending = None
-        if self._settled > 0:
+        if self._refused > _MAX_PENDING - _LOOK_INTERVAL:  # so soon it would be the same again
             return None
+        if (
+            found is not None
+            and self._settled > 0
+            and not self._may_be_open(found, view, world, noise, submap)
+        ):
+            found = None
         newest = next(k for k in reversed(world.keyframes) if k.submap == submap)
-        place = None if found is None else self._place_of(found, world, noise, submap)
+        place = None if found is None else self._place_of(found, view, world, noise, submap)
         if place is not None:
             return self._judge(view, world, noise, newest, place, is_sure=True)
         if self._pending is None and self._since_look < _LOOK_INTERVAL:
@@ -168,10 +174,32 @@ class LoopFinder:
         place = self._relocaliser.recognise(view.sight, world, noise, candidates)
         return None if place is None else self._judge(view, world, noise, newest, place, is_sure=False)
 
-    def _place_of(self, found: Revisit, world: WorldMap, noise: NoiseModel, submap: int) -> Place | None:
+    def _may_be_open(
+        self, found: Revisit, view: LoopView, world: WorldMap, noise: NoiseModel, submap: int
+    ) -> bool:
+        """Whether what was settled is in question: old landmarks are seen elsewhere than expected.
+
+        Those of the newest keyframes don't count: around a loop just closed, they have yet to settle.
+        """
+        mine = world.keyframes_of(submap)
+        if len(mine) <= _NUM_RECENT or found.keyframe_id >= mine[-_NUM_RECENT].frame_id:
+            return False
+        ids, xy = found.ids[found.points.ok], found.points.xy[found.points.ok]
+        return not self._is_near(view, world.landmarks.xyz_of(ids), xy, noise)
+
+    def _is_near(self, view: LoopView, xyz: Array, xy: Array, noise: NoiseModel) -> bool:
+        """Whether landmarks of long ago are, by their median, seen where the view's pose has them."""
+        residual, in_front = reprojection_residual(self._camera, invert_transform(view.T_world_cam), xyz, xy)
+        away_px = float(np.median(np.where(in_front, np.linalg.norm(residual, axis=1), np.inf)))
+        return away_px < GATE_SIGMAS * max(OLD_SIGMA_PX, noise.sigma0_px)
+
+    def _place_of(
+        self, found: Revisit, view: LoopView, world: WorldMap, noise: NoiseModel, submap: int
+    ) -> Place | None:
         """Where a frame is that sees landmarks of long ago, going by these alone.
 
-        Those of unknown depth have no say: together they agree with a pose far off.
+        Those of unknown depth have no say: together they agree with a pose far off. So do at times those of
+        poor depth: what a place makes of epipolar lines must be better than what the frame's pose does.
         """
         has_say = found.points.ok & tells_depth(self._camera, world.keyframes_of(submap), found.ids)
         ids, xy = found.ids[has_say], found.points.xy[has_say]
@@ -181,6 +209,13 @@ class LoopFinder:
         if pose is None or pose.num_inliers < max(_MIN_FOUND, _MIN_FOUND_SHARE * len(ids)):
             return None
         T_world_cam = invert_transform(pose.T_cam_world)
+        gate_px = GATE_SIGMAS * max(OLD_SIGMA_PX, noise.sigma0_px)
+        off_px2, off_before_px2 = (
+            np.minimum(off_lines_px(self._camera, world, found, T) ** 2, gate_px**2).sum()
+            for T in (T_world_cam, view.T_world_cam)
+        )
+        if off_px2 > max(off_before_px2, OLD_SIGMA_PX**2 * found.points.ok.sum()):
+            return None
         return Place(T_world_cam, found.keyframe_id, ids[pose.inliers], xy[pose.inliers], submap)
 
     def _judge(
@@ -194,13 +229,10 @@ class LoopFinder:
         is_sure: bool,
     ) -> Loop | None:
         """What a recognised place means: that nothing has drifted, or a loop."""
-        xyz = world.landmarks.xyz_of(place.ids)
-        residual, in_front = reprojection_residual(
-            self._camera, invert_transform(view.T_world_cam), xyz, place.xy
-        )
-        away_px = float(np.median(np.where(in_front, np.linalg.norm(residual, axis=1), np.inf)))
-        if away_px < GATE_SIGMAS * max(OLD_SIGMA_PX, noise.sigma0_px):
-            self._pending, self._settled, self._refused = None, _NUM_RECENT, 0
+        if self._is_near(view, world.landmarks.xyz_of(place.ids), place.xy, noise):
+            self._pending, self._refused = None, 0
+            if self._settled <= 0 or place.keyframe_id <= self._tied_id:
+                self._settled, self._tied_id = _NUM_RECENT, place.keyframe_id
             return None
         fresh = ~np.isin(view.ids, place.ids)  # what is followed anyway knows no other scale
         similarity = submap_similarity(place, world, view.T_world_cam, view.ids[fresh], view.xy[fresh])
@@ -212,7 +244,8 @@ class LoopFinder:
             depth = loop.scale * median_depth(world, newest)
             if before is None or not before.agrees(loop, view, depth):
                 return None
-        self._pending, self._settled, self._refused = None, _NUM_RECENT, 0
+        self._pending, self._refused = None, 0
+        self._settled, self._tied_id = _NUM_RECENT, place.keyframe_id
         return loop
 
     def refuse(self) -> None:
@@ -220,21 +253,26 @@ class LoopFinder:
 
         Nothing of it may be used meanwhile: landmark by landmark the map would be tied to it.
         """
-        self._settled, self._refused = _LOOK_INTERVAL, _MAX_PENDING
+        self._settled, self._refused = 0, _MAX_PENDING
 
-    def note_tie(self) -> None:
-        """Note that landmarks of long ago were found where they should be: no loop can open meanwhile."""
-        if self._settled > 0:
+    def note_tie(self, keyframe_id: int) -> None:
+        """Note that a keyframe's landmarks were found where they should be: nothing has drifted since it.
+
+        What was known of an older one is not prolonged by that.
+        """
+        if self._settled > 0 and keyframe_id <= self._tied_id:
             self._settled = _NUM_RECENT
 
     def _candidates(self, world: WorldMap, submap: int, T_world_cam: Array) -> list[Keyframe]:
-        """Old keyframes the camera may be at if it has drifted."""
+        """Old keyframes the camera may be at if it has drifted on the way that no tie makes up for."""
         mine = world.keyframes_of(submap)
         if len(mine) <= _NUM_RECENT:
             return []
         newest, older = mine[-1], mine[:-_NUM_RECENT]
         position = np.stack([k.T_world_cam[:3, 3] for k in mine])
         steps = np.linalg.norm(np.diff(position, axis=0), axis=1)
+        if self._settled > 0:
+            steps[np.array([k.frame_id for k in mine[1:]]) > self._tied_id] = 0.0
         way = (steps.sum() - np.concatenate([[0.0], np.cumsum(steps)]))[: len(older)]
         apart = np.linalg.norm(position[: len(older)] - T_world_cam[:3, 3], axis=1)
         axis = np.stack([k.T_world_cam[:3, 2] for k in older])
@@ -263,9 +301,13 @@ def share_out(world: WorldMap, submap: int, loop: Loop) -> tuple[Ids, SolvedGrap
     constraints = [step.constraint for step in steps_of(world, mine)]
     for new, old in world.revisits.items():
         if new in row and old in row:
-            constraints.append(_tie(world, mine, row[old], row[new], mine[row[new]].T_world_cam, 1.0))
+            constraints.append(
+                _tie(world, mine, row[old], row[new], mine[row[new]].T_world_cam, 1.0, _FORMER_SIGMA)
+            )
     old, new = row[loop.place.keyframe_id], row[loop.keyframe_id]
-    constraints.append(_tie(world, mine, old, new, loop.moved(mine[new].T_world_cam), loop.scale))
+    constraints.append(
+        _tie(world, mine, old, new, loop.moved(mine[new].T_world_cam), loop.scale, _PLACE_SIGMA)
+    )
     solved = solve_graph(np.stack([k.T_world_cam for k in mine]), constraints)
     if solved is None or solved.cost > _MAX_COST:
         return None
@@ -273,9 +315,15 @@ def share_out(world: WorldMap, submap: int, loop: Loop) -> tuple[Ids, SolvedGrap
 
 
 def _tie(
-    world: WorldMap, mine: Sequence[Keyframe], old: int, new: int, T_world_new: Array, scale: float
+    world: WorldMap,
+    mine: Sequence[Keyframe],
+    old: int,
+    new: int,
+    T_world_new: Array,
+    scale: float,
+    sigma: tuple[float, float, float],
 ) -> PoseConstraint:
     """What a place that was recognised says of two keyframes."""
     T = invert_transform(mine[old].T_world_cam) @ T_world_new
     depth = usable_depth(world, mine[old], float(np.linalg.norm(T[:3, 3])))
-    return PoseConstraint(old, new, T, scale, (_PLACE_RAD, _PLACE_DEPTH * depth, _PLACE_SCALE))
+    return PoseConstraint(old, new, T, scale, (sigma[0], sigma[1] * depth, sigma[2]))

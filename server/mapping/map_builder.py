@@ -292,7 +292,7 @@ class MapBuilder:
         logger.debug("frame %d: %d landmarks of keyframe %d again", frame_id, len(ids), found.keyframe_id)
         world.note_sight(ids, np.ones(len(ids), bool), frame_id)
         world.revisits[frame_id] = found.keyframe_id
-        self.loops.note_tie()
+        self.loops.note_tie(found.keyframe_id)
         return len(ids)
 
     def wants_keyframe(

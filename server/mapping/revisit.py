@@ -65,6 +65,8 @@ _NEIGHBOURS = 6
 _MIN_PARALLAX_DEG = 1.0
 #: A depth that changes by more than this factor (as a logarithm) is that of another point along the line.
 _MAX_LOG_DEPTH = 0.7
+#: Share of the found landmarks that must agree with one place each: of wrong ones some do by chance.
+_MIN_PLACED_SHARE = 0.25
 
 
 @dataclass(frozen=True)
@@ -185,6 +187,14 @@ def _look(
     return Revisit(keyframe.frame_id, keyframe.ids[rows], replace(points, xy=all_xy, ok=ok))
 
 
+def off_lines_px(camera: Intrinsics, world: WorldMap, found: Revisit, T_world_cam: Array) -> Array:
+    """Distances ``(N,)`` of found points to their epipolar lines if the newest frame is there."""
+    ids, xy = found.ids[found.points.ok], found.points.xy[found.points.ok]
+    keyframe = next(k for k in world.keyframes if k.frame_id == found.keyframe_id)
+    F = fundamental_matrix(camera, invert_transform(T_world_cam) @ keyframe.T_world_cam)
+    return np.abs(sampson_px(F, keyframe.xy[np.searchsorted(keyframe.ids, ids)], xy))
+
+
 def tells_depth(camera: Intrinsics, keyframes: Sequence[Keyframe], ids: Ids) -> NDArray[np.bool_]:
     """Which landmarks ``ids (N,)``, ascending, keyframes saw under angles that tell how far away they are."""
     seen = gather_observations(keyframes, ids)
@@ -246,6 +256,8 @@ def place_anew(
     change = np.abs(np.log(np.maximum(depth, 1e-9) / np.maximum(depth_before, 1e-9)))
     sound = placed.in_front & (placed.error_sigma < MAX_ERROR_SIGMA) & (change < _MAX_LOG_DEPTH)
     good &= ~told | sound
+    if good.sum() < _MIN_PLACED_SHARE * count:
+        good[:] = False
     world.move_landmarks(ids[good & told], xyz[good & told])
     ok = found.points.ok.copy()
     ok[ok] = good

@@ -1,12 +1,13 @@
 """A camera that is back where it was, in a map that has drifted: the loop is found, and drift shared out."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from semcast.common.camera import Intrinsics
-from semcast.common.geometry import exp_so3, invert_transform, make_transform
+from semcast.common.geometry import exp_so3, invert_transform, make_transform, rotation_angle_deg
 from semcast.server.geometry.features import TrackedPoints
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.loop_closure import _LOOK_INTERVAL, Loop, LoopFinder, LoopView, share_out
@@ -151,9 +152,7 @@ def test_landmarks_of_unknown_depth_prove_no_place(room, rng):
 
 def test_where_nothing_has_drifted_there_is_no_loop_and_none_is_looked_for(room, rng):
     world, _ = room
-    for keyframe in world.keyframes:
-        world.move_keyframe(keyframe.frame_id, around(keyframe.frame_id))
-    world.landmarks.xyz = room[1][world.landmarks.ids % 10_000]
+    put_right(room)
     recogniser = Recogniser()
     finder = LoopFinder(CAMERA, recogniser, 0)
     of_newest = view(room, HERE)
@@ -167,6 +166,64 @@ def test_where_nothing_has_drifted_there_is_no_loop_and_none_is_looked_for(room,
     assert recogniser.asked == []
     finder.look(here, world, NOISE, 0, None)
     assert len(recogniser.asked) == 1, "after twenty keyframes something may have drifted"
+
+
+def put_right(room):
+    """Take all drift out of a map."""
+    world, xyz = room
+    for keyframe in world.keyframes:
+        world.move_keyframe(keyframe.frame_id, around(keyframe.frame_id))
+    world.landmarks.xyz = xyz[world.landmarks.ids % 10_000]
+
+
+def test_a_place_that_fits_epipolar_lines_worse_than_the_pose_is_none(room, rng):
+    """Landmarks of poor depth may agree with a pose far off, though two images tell better."""
+    world, _ = room
+    found = old_landmarks(room, HERE, rng, off_px=0.1)
+    put_right(room)
+    poor = rng.permutation(len(found.ids))[: int(0.7 * len(found.ids))]
+    wrong = HERE @ make_transform(exp_so3([0.0, 0.2, 0.0]), [1.2, 0.0, 0.3])
+    rays = CAMERA.unproject(found.points.xy[poor]) @ wrong[:3, :3].T
+    world.move_landmarks(found.ids[poor], wrong[:3, 3] + rng.uniform(3.0, 4.0, (len(poor), 1)) * rays)
+    of_newest = view(room, HERE)
+    here = LoopView(of_newest.sight, HERE, of_newest.ids, of_newest.xy)
+    assert LoopFinder(CAMERA, Recogniser(), 0).look(here, world, NOISE, 0, found) is None
+
+
+def test_a_loop_that_is_still_open_is_closed_further_at_once(room, rng):
+    finder, found = LoopFinder(CAMERA, Recogniser(), 0), old_landmarks(room, HERE, rng)
+    assert look(finder, room, found) is not None
+    assert look(finder, room, found) is not None
+    assert look(finder, room, replace(found, keyframe_id=NUM - 10)) is None, "these have yet to settle"
+
+
+def test_what_has_not_drifted_since_a_keyframe_may_have_before_it(room, rng):
+    put_right(room)
+    found, of_newest = old_landmarks(room, HERE, rng), view(room, HERE)
+    here = LoopView(of_newest.sight, HERE, of_newest.ids, of_newest.xy)
+    recogniser = Recogniser(Place(HERE, 1, found.ids, found.points.xy, 0))
+    finder = LoopFinder(CAMERA, recogniser, 0)
+    for _ in range(2 * _LOOK_INTERVAL):
+        assert finder.look(here, room[0], NOISE, 0, None) is None
+    assert len(recogniser.asked) == 1, "there is none before it from which drift may have led here"
+    recogniser = Recogniser(Place(HERE, NUM - 15, found.ids, found.points.xy, 0))
+    finder = LoopFinder(CAMERA, recogniser, 0)
+    for _ in range(2 * _LOOK_INTERVAL):
+        assert finder.look(here, room[0], NOISE, 0, None) is None
+    assert len(recogniser.asked) == 2
+
+
+@pytest.mark.parametrize(("tied_id", "is_prolonged"), [(0, True), (5, False)])
+def test_only_ties_as_old_prolong_what_is_known(room, rng, tied_id, is_prolonged):
+    put_right(room)
+    found, of_newest, recogniser = old_landmarks(room, HERE, rng), view(room, HERE), Recogniser()
+    here = LoopView(of_newest.sight, HERE, of_newest.ids, of_newest.xy)
+    finder = LoopFinder(CAMERA, recogniser, 0)
+    assert finder.look(here, room[0], NOISE, 0, found) is None
+    for _ in range(25):
+        finder.note_tie(tied_id)
+        finder.look(here, room[0], NOISE, 0, None)
+    assert (recogniser.asked == []) == is_prolonged
 
 
 def place(room, T_true, rng):
@@ -308,7 +365,11 @@ def test_a_loop_that_no_drift_explains_is_none(room, turn_deg, is_drift):
     T_world_new = newest.T_world_cam @ make_transform(exp_so3(np.radians([turn_deg, 0.0, 0.0])), np.zeros(3))
     place = Place(T_world_new, old_id, np.zeros(0, np.int64), np.zeros((0, 2)), 0)
     loop = Loop(newest.frame_id, place, 1.0, T_world_new @ invert_transform(newest.T_world_cam))
-    assert (share_out(world, 0, loop) is not None) == is_drift
+    shared = share_out(world, 0, loop)
+    assert (shared is not None) == is_drift
+    if shared is not None:
+        left_deg = rotation_angle_deg(T_world_new[:3, :3].T @ shared[1].T_world_cam[-1, :3, :3])
+        assert left_deg < 0.02, "landmarks of there are to be found where they are"
 
 
 def test_ties_made_before_hold(room, rng):

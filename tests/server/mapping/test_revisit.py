@@ -129,6 +129,19 @@ def test_a_landmark_whose_depth_was_wrong_is_found_too_and_placed_anew(mapped, r
     assert np.median(after[ok]) < 0.02
 
 
+def test_where_few_agree_with_one_place_it_is_by_chance(mapped, rng):
+    world, _ = mapped
+    here = pose(0.2, 0.2)
+    found = look(mapped, here)
+    points = found.points
+    wrong = np.flatnonzero(points.ok)[: int(0.9 * points.ok.sum())]
+    xy = points.xy.copy()
+    xy[wrong] += rng.choice([-1.0, 1.0], (len(wrong), 2)) * rng.uniform(15.0, 40.0, (len(wrong), 2))
+    before = world.landmarks.xyz.copy()
+    assert not place(mapped, replace(found, points=replace(points, xy=xy)), here).ok.any()
+    np.testing.assert_array_equal(world.landmarks.xyz, before)
+
+
 def test_where_rays_tell_no_depth_a_landmark_stays_and_has_to_be_seen_there(mapped, rng):
     world, _ = mapped
     here = pose(0.005)
