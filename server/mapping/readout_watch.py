@@ -139,6 +139,7 @@ class ReadoutWatch:
         # readout longer than any camera's, and images put right for that would be spoilt.
         if is_sure and least_ms <= fit.readout.ms <= MAX_READOUT_MS:
             self._found, self._axis, self._evidence = fit.readout, fit.readout.axis, PatternEvidence()
+            self._lens_doubt = None  # of images that have yet to be put right
         else:
             is_known = num_views >= _ENOUGH_VIEWS and sigma_ms <= _SURE_MS
             self._is_done = is_known or num_views >= _MOST_VIEWS

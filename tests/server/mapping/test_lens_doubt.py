@@ -86,3 +86,18 @@ def test_a_doubt_is_told_at_once_where_no_other_look_is_to_come(monkeypatch, cap
     watch.take(replace(result, problem=replace(result.problem, keyframe_ids=np.arange(20, 32))))
     assert not watch.is_on, "24 views know the readout"
     assert [r.getMessage()[:2] for r in caplog.records] == ["a,"]
+
+
+def test_a_doubt_from_before_a_rolling_shutter_was_put_right_is_dropped(monkeypatch, caplog):
+    watch = ReadoutWatch(CAMERA, is_wanted=True)
+    fit, calls = readout_watch.fit_readout, iter([lambda *_: None])
+    monkeypatch.setattr(readout_watch, "lens_doubt", lambda *_: "a")
+    monkeypatch.setattr(readout_watch, "fit_readout", lambda *known: next(calls, fit)(*known))
+    rolling = replace(CAMERA, readout_ms=25.0)
+    for k in range(2):
+        result = adjusted(rolling, seed=k)
+        ids = result.problem.keyframe_ids + 20 * k
+        watch.take(replace(result, problem=replace(result.problem, keyframe_ids=ids)))
+    assert watch.take_found() is not None
+    watch.conclude()
+    assert [r for r in caplog.records if "readout_watch" in r.name] == []
