@@ -276,16 +276,18 @@ def _send_lossless(
     session.subscribe(flow_key(agent_id), "newest", on_flow)
     encoded: SymbolFrame | None = None
     expected_s = time.monotonic() + READY_S
-    is_told = False
+    told = set[str]()
     while not stop.is_set():
-        if not is_told and not window.is_wanted and time.monotonic() > expected_s:
-            is_told = True
+        if not window.is_wanted and time.monotonic() > expected_s:
+            expected_s = time.monotonic() + READY_S
             why = (
                 "one in live mode takes none of an agent in replay mode (--mode)"
                 if "server" in session.alive_roles(agent_id)
                 else f"there is none of the name {agent_id!r} (another --agent-id?)"
             )
-            logger.warning("no server asks for frames: %s", why)
+            if why not in told:
+                logger.warning("no server asks for frames: %s", why)
+            told.add(why)
         if encoded is None and not capture.ended:
             # While the receiver is busy, one frame is encoded ahead.
             frame = capture.get(_FLOW_POLL_S if window.all_taken else _BUSY_POLL_S)
