@@ -25,6 +25,8 @@ cleanup() {
   rm -rf "$scratch"
 }
 trap cleanup EXIT INT TERM
+# Opened here: the viewer starts beside this script, and may come to its log only when that is cleaned up.
+exec 3>"$scratch/rerun.log"
 
 free_port() {
   "$python" -c 'import socket; s = socket.socket(); s.bind(("127.0.0.1", 0)); print(s.getsockname()[1])'
@@ -50,7 +52,7 @@ native)
   # A screen larger than the window keeps the pointer, which starts in its middle, off the picture.
   VK_ICD_FILENAMES=$icd XDG_RUNTIME_DIR=$scratch WINIT_X11_SCALE_FACTOR=1 \
     setsid xvfb-run -a -s "-screen 0 4096x2400x24" \
-    "$rerun" --bind 127.0.0.1 --port "$port" "$run" --window-size "$size" >"$scratch/rerun.log" 2>&1 &
+    "$rerun" --bind 127.0.0.1 --port "$port" "$run" --window-size "$size" >&3 2>&3 &
   viewer=$!
   sleep "$wait_s"
   photograph_window "$port" || { tail -5 "$scratch/rerun.log" >&2; exit 1; }
@@ -58,7 +60,7 @@ native)
 web)
   port=$(free_port) web_port=$(free_port)
   setsid "$rerun" --bind 127.0.0.1 --port "$port" --serve-web --web-viewer-port "$web_port" "$run" \
-    >"$scratch/rerun.log" 2>&1 &
+    >&3 2>&3 &
   viewer=$!
   i=0
   until "$python" -c "import socket; socket.create_connection(('127.0.0.1', $web_port), 1)" 2>/dev/null; do
