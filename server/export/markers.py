@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import ConfigError, SourceError
 from semcast.common.geometry import align_umeyama, exp_so3, invert_transform
+from semcast.common.image_file import read_image
 from semcast.common.run_folder import RunData
 from semcast.server.export.placement import TWO_SIDED_95, Placement
+from semcast.server.geometry.features import to_grey
 from semcast.server.geometry.triangulation import triangulate
 
 Array = NDArray[np.float64]
@@ -220,12 +222,14 @@ def place_by_marker(
         )
     sightings = Sightings(dictionary)
     for frame_id, path in posed.items():
-        # OpenCV would end the process where a name is no text.
-        file = np.fromfile(path, dtype=np.uint8) if path.is_file() else np.empty(0, dtype=np.uint8)
-        grey = cv2.imdecode(file, cv2.IMREAD_GRAYSCALE) if file.size else None
-        if grey is None or grey.shape != data.intrinsics.shape_hw:
-            raise SourceError(f"{path} must be an image of {data.intrinsics.width}x{data.intrinsics.height}")
-        sightings.look(frame_id, np.asarray(grey, dtype=np.uint8))
+        expected = f"{path} must be an image of {data.intrinsics.width}x{data.intrinsics.height}"
+        try:
+            grey = to_grey(read_image(path))
+        except SourceError as err:
+            raise SourceError(expected) from err
+        if grey.shape != data.intrinsics.shape_hw:
+            raise SourceError(expected)
+        sightings.look(frame_id, grey)
     return sightings.place(T_world_cam, data.intrinsics, side_m, marker_id)
 
 

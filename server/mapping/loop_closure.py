@@ -19,7 +19,7 @@ from semcast.server.geometry.pnp import reprojection_residual, search_pose
 from semcast.server.geometry.weighting import GATE_SIGMAS, NoiseModel
 from semcast.server.mapping.pose_graph import PoseConstraint, SolvedGraph, solve_graph
 from semcast.server.mapping.relocalisation import MAX_CONSIDERED, Place, Relocaliser, submap_similarity
-from semcast.server.mapping.revisit import OLD_SIGMA_PX, Revisit, off_lines_px, tells_depth
+from semcast.server.mapping.revisit import Revisit, off_lines_px, old_sigma_px, tells_depth
 from semcast.server.mapping.scene_depth import median_depth
 from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.steps import steps_of, usable_depth
@@ -125,7 +125,7 @@ class LoopFinder:
         self._pending: Loop | None = None
         self._since_pending = self._since_look = 0
         self._settled = self._refused = 0
-        self._tied_id = -1
+        self._tied_id = -1  # keyframe since which nothing has drifted, while that is settled
 
     @property
     def is_in_doubt(self) -> bool:
@@ -191,7 +191,7 @@ class LoopFinder:
         """Whether landmarks of long ago are, by their median, seen where the view's pose has them."""
         residual, in_front = reprojection_residual(self._camera, invert_transform(view.T_world_cam), xyz, xy)
         away_px = float(np.median(np.where(in_front, np.linalg.norm(residual, axis=1), np.inf)))
-        return away_px < GATE_SIGMAS * max(OLD_SIGMA_PX, noise.sigma0_px)
+        return away_px < GATE_SIGMAS * old_sigma_px(noise)
 
     def _place_of(
         self, found: Revisit, view: LoopView, world: WorldMap, noise: NoiseModel, submap: int
@@ -199,22 +199,23 @@ class LoopFinder:
         """Where a frame is that sees landmarks of long ago, going by these alone.
 
         Those of unknown depth have no say: together they agree with a pose far off. So do at times those of
-        poor depth: what a place makes of epipolar lines must be better than what the frame's pose does.
+        poor depth: found points must be no further from epipolar lines than at the frame's pose, or than
+        their noise.
         """
         has_say = found.points.ok & tells_depth(self._camera, world.keyframes_of(submap), found.ids)
         ids, xy = found.ids[has_say], found.points.xy[has_say]
-        sigma = np.full(len(ids), max(OLD_SIGMA_PX, noise.sigma0_px))
+        sigma_px = old_sigma_px(noise)
+        sigma = np.full(len(ids), sigma_px)
         xyz = world.landmarks.xyz_of(ids)
         pose = search_pose(self._camera, xyz, xy, sigma, GATE_SIGMAS * sigma, seed=self._seed)
         if pose is None or pose.num_inliers < max(_MIN_FOUND, _MIN_FOUND_SHARE * len(ids)):
             return None
         T_world_cam = invert_transform(pose.T_cam_world)
-        gate_px = GATE_SIGMAS * max(OLD_SIGMA_PX, noise.sigma0_px)
-        off_px2, off_before_px2 = (
-            np.minimum(off_lines_px(self._camera, world, found, T) ** 2, gate_px**2).sum()
+        off, off_before = (
+            np.minimum((off_lines_px(self._camera, world, found, T) / sigma_px) ** 2, GATE_SIGMAS**2).mean()
             for T in (T_world_cam, view.T_world_cam)
         )
-        if off_px2 > max(off_before_px2, OLD_SIGMA_PX**2 * found.points.ok.sum()):
+        if off > max(off_before, 1.0):
             return None
         return Place(T_world_cam, found.keyframe_id, ids[pose.inliers], xy[pose.inliers], submap)
 

@@ -29,7 +29,7 @@ from semcast.server.mapping.pose_covariance import pose_covariance
 from semcast.server.mapping.readout_watch import ReadoutWatch
 from semcast.server.mapping.recall import recall_landmarks
 from semcast.server.mapping.relocalisation import Place, Relocaliser, submap_similarity
-from semcast.server.mapping.revisit import OLD_SIGMA_PX, Revisit, find_revisit, place_anew
+from semcast.server.mapping.revisit import Revisit, find_revisit, old_sigma_px, place_anew
 from semcast.server.mapping.rolling_shutter import ImageFlow
 from semcast.server.mapping.scene_depth import usual_depth
 from semcast.server.mapping.settings import ReconstructionSettings
@@ -257,7 +257,7 @@ class MapBuilder:
         return (found is not None and self._take_up(found, tracks, sight, T_world_cam) > 0) or closed
 
     def _find_revisit(self, tracks: TrackTable, sight: Sight, T_world_cam: Array) -> Revisit | None:
-        gate_px = GATE_SIGMAS * max(OLD_SIGMA_PX, self.noise.model.sigma0_px)
+        gate_px = GATE_SIGMAS * old_sigma_px(self.noise.model)
         return find_revisit(self._mapped, tracks.ids, sight, T_world_cam, gate_px=gate_px)
 
     def _close(self, loop: Loop) -> bool:
@@ -279,8 +279,7 @@ class MapBuilder:
     def _take_up(self, found: Revisit, tracks: TrackTable, sight: Sight, T_world_cam: Array) -> int:
         """Give landmarks of long ago their tracks back; how many."""
         world, noise = self.world, self.noise.model
-        sigma_px = max(OLD_SIGMA_PX, noise.sigma0_px)
-        points = place_anew(self._camera, world, found, T_world_cam, noise, sigma_px)
+        points = place_anew(self._camera, world, found, T_world_cam, noise, old_sigma_px(noise))
         room = int(_MAX_TRACKS_SHARE * self._settings.max_features) - int(tracks.visible.sum())
         points = points.strongest(max(0, room))
         # Where an old landmark and a young track are in one place, the young one gives way.

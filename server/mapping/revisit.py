@@ -34,7 +34,7 @@ Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
 
 #: Standard deviation of positions that were found from an image of long ago.
-OLD_SIGMA_PX = 1.0
+_OLD_SIGMA_PX = 1.0
 #: The newest keyframes, which are never a revisit: an adjustment has most of them in its window.
 NUM_RECENT = 12
 #: Old keyframes nearest to the camera whose landmarks are projected, at most.
@@ -93,6 +93,11 @@ class _Expected:
     rows: NDArray[np.intp]
     xy: Array
     warps: Array
+
+
+def old_sigma_px(noise: NoiseModel) -> float:
+    """Standard deviation in pixels of where a landmark of long ago is found again."""
+    return max(_OLD_SIGMA_PX, noise.sigma0_px)
 
 
 def find_revisit(
@@ -188,7 +193,14 @@ def _look(
 
 
 def off_lines_px(camera: Intrinsics, world: WorldMap, found: Revisit, T_world_cam: Array) -> Array:
-    """Distances ``(N,)`` of found points to their epipolar lines if the newest frame is there."""
+    """Distances ``(N,)`` of found points to their epipolar lines if the newest frame is there (Eq. 14).
+
+    Args:
+        camera: Pinhole.
+        world: The map.
+        found: Landmarks of an old keyframe; those that are ``ok`` count.
+        T_world_cam: ``(4, 4)``, where the newest frame is taken to be.
+    """
     ids, xy = found.ids[found.points.ok], found.points.xy[found.points.ok]
     keyframe = next(k for k in world.keyframes if k.frame_id == found.keyframe_id)
     F = fundamental_matrix(camera, invert_transform(T_world_cam) @ keyframe.T_world_cam)

@@ -58,6 +58,10 @@ def test_views_that_say_nothing_give_no_doubt():
     assert lens_doubt([], 1.0, CAMERA) is None
 
 
+def said(caplog):
+    return [r.getMessage() for r in caplog.records if r.name == readout_watch.__name__]
+
+
 @pytest.mark.parametrize(
     ("doubts", "told_at"),
     [([None, "a", None, None], []), ([None, "a", "b", "c"], [2]), ([None, "a", None, "b"], ["end"])],
@@ -71,11 +75,11 @@ def test_a_doubt_is_told_once_where_the_next_look_or_none_confirms_it(doubts, to
     for look in range(-1, len(doubts)):  # the first has too few views
         ids = result.problem.keyframe_ids + 100 * look
         watch.take(replace(result, problem=replace(result.problem, keyframe_ids=ids)))
-        told += [look] * len(caplog.records)
+        told += [look] * len(said(caplog))
         caplog.clear()
     watch.conclude()
     watch.conclude()
-    assert told + ["end"] * len(caplog.records) == told_at
+    assert told + ["end"] * len(said(caplog)) == told_at
 
 
 def test_a_doubt_is_told_at_once_where_no_other_look_is_to_come(monkeypatch, caplog):
@@ -85,7 +89,7 @@ def test_a_doubt_is_told_at_once_where_no_other_look_is_to_come(monkeypatch, cap
     watch.take(result)
     watch.take(replace(result, problem=replace(result.problem, keyframe_ids=np.arange(20, 32))))
     assert not watch.is_on, "24 views know the readout"
-    assert [r.getMessage()[:2] for r in caplog.records] == ["a,"]
+    assert [text[:2] for text in said(caplog)] == ["a,"]
 
 
 def test_a_doubt_from_before_a_rolling_shutter_was_put_right_is_dropped(monkeypatch, caplog):
@@ -100,4 +104,4 @@ def test_a_doubt_from_before_a_rolling_shutter_was_put_right_is_dropped(monkeypa
         watch.take(replace(result, problem=replace(result.problem, keyframe_ids=ids)))
     assert watch.take_found() is not None
     watch.conclude()
-    assert [r for r in caplog.records if "readout_watch" in r.name] == []
+    assert said(caplog) == []
