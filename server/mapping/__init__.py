@@ -31,6 +31,7 @@ Pose of a frame
 Start of a map
     initialiser       two views with parallax, the frames between them, and an adjustment
     scene_motion      whether a relative pose is that of the scene or of a large moving thing
+    start_geometry    frames between two views of known motion, and points of them all
     start_alignment   drift of the tracks a map begins with
     start_attempts    which attempts at a start are put off, and which are made again
     ambiguity         which of several structures that fit the first views is right

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.server.mapping.camera_motion import CameraMotion
-from semcast.server.mapping.initialiser import Start
+from semcast.server.mapping.start_geometry import Start
 
 Array = NDArray[np.float64]
 

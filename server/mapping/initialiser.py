@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.common.geometry import interpolate_pose, invert_transform
+from semcast.common.geometry import invert_transform
 from semcast.server.geometry.epipolar import (
     fit_rotation,
     fundamental_matrix,
@@ -18,18 +18,16 @@ from semcast.server.geometry.epipolar import (
     sampson_px,
     turn_in_doubt_deg,
 )
-from semcast.server.geometry.triangulation import Triangulation, triangulate
 from semcast.server.geometry.two_view import MIN_MATCHES
 from semcast.server.geometry.weighting import MAD_TO_SIGMA, ConfidenceMode, NoiseModel, fuse_confidence
 from semcast.server.mapping.ambiguity import Structure, decide
 from semcast.server.mapping.hypotheses import hypothesis_of, poses_in, problem_of
-from semcast.server.mapping.kept_frames import Observed, keyframe_of, pose_of
-from semcast.server.mapping.observations import gather_observations
+from semcast.server.mapping.kept_frames import Observed
 from semcast.server.mapping.scene_motion import SceneMotion, motion_of_scene
 from semcast.server.mapping.start_alignment import aligned_views
 from semcast.server.mapping.start_attempts import Patience, Undecided
+from semcast.server.mapping.start_geometry import MIN_POINTS, Start, StartGeometry
 from semcast.server.mapping.track_ids import shared_rows
-from semcast.server.mapping.world_map import Keyframe
 
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
@@ -39,10 +37,6 @@ _NONE: Ids = np.zeros(0, np.int64)
 MAX_HISTORY = 300
 #: Of them, those whose images are kept too: 10 MB of 640x480.
 _MAX_IMAGES = 32
-#: Keyframes of a new map at most.
-START_KEYFRAMES = 5
-#: Points of a new map at least.
-MIN_POINTS = 40
 #: Views of a start: two of a scene with little perspective can't tell it from its mirror image in depth.
 _MIN_VIEWS = 3
 #: Attempts in which tracks did not last for that many views, after which two have to do.
@@ -77,29 +71,6 @@ _MIN_PARALLAX_DOUBTS = 2.0
 #: Where the camera only turned and tracks err alike in all directions, that is 1.7, and was up to 3.3 after a
 #: search for lines along which they err; at starts it has been 5.4 and more, over poor links too.
 _MIN_RELIEF_SIGMAS = 4.0
-#: Least angle between the rays of a point of a start, as a share of the one that is asked for later: its
-#: views are near each other.
-_PARALLAX_SHARE = 0.5
-#: RMS error of such a point at most, in standard deviations. It is larger than a landmark's may be
-#: (``new_landmarks.MAX_ERROR_SIGMA``), as a start is adjusted at once.
-_MAX_ERROR_SIGMA = 2.5
-
-
-@dataclass(frozen=True)
-class Start:
-    """A new map in its own frame: the first keyframe at the origin, median depth about 1.
-
-    Attributes:
-        keyframes: In order of time, without descriptors.
-        ids: ``(P,)`` int64 landmarks.
-        xyz: ``(P, 3)``.
-        confidence: ``(P,)`` mean over observations.
-    """
-
-    keyframes: list[Keyframe]
-    ids: Ids
-    xyz: Array
-    confidence: Array
 
 
 @dataclass(frozen=True)
@@ -149,7 +120,7 @@ class Initialiser:
     def __init__(self, camera: Intrinsics, mode: ConfidenceMode, min_parallax_deg: float, seed: int) -> None:
         self._camera = camera
         self._mode: ConfidenceMode = mode
-        self._min_parallax_deg = min_parallax_deg
+        self._geometry = StartGeometry(camera, min_parallax_deg, seed)
         self._seed = seed
         self.clear()
 
@@ -371,7 +342,7 @@ class Initialiser:
             ids: Tracks that agree with it.
             expected: Noise of observations, as it was before this scene was seen.
         """
-        T_world_cam = self._poses_in(span, scene, ids)
+        T_world_cam = self._geometry.poses_between(span, scene, ids)
         if T_world_cam is None or (len(T_world_cam) < _MIN_VIEWS and self._too_short.puts_off()):
             return None
         poses = np.stack([T_world_cam[k] for k in sorted(T_world_cam)])
@@ -381,42 +352,7 @@ class Initialiser:
             return None
         T_cam_world = invert_transform(structure.T_world_cam) @ structure.T_world_cam[0]
         # Where nothing moves by itself, points may err as they are expected to: the more the better.
-        return self._start_of(views, T_cam_world, scene.noise if scene.alone.any() else expected)
-
-    def _poses_in(self, span: list[Observed], scene: SceneMotion, ids: Ids) -> dict[int, Array] | None:
-        """Poses of the ends and of frames between, by place in the span; None where nothing has depth."""
-        T_last_first, last = scene.motion.T_cam1_cam0, len(span) - 1
-        T_world_cam = {0: np.eye(4), last: invert_transform(T_last_first)}
-        ends = np.stack([np.eye(4), T_last_first])
-        points = self._triangulate([span[0], span[-1]], ends, ids, scene.noise)
-        good = self._passes(points)
-        if int(good.sum()) < MIN_POINTS:
-            return None
-        known = ids[good], points.xyz[good]
-        for k in _between(span):
-            guess = interpolate_pose(T_world_cam[0], T_world_cam[last], k / last)
-            T_world_inner = pose_of(self._camera, span[k], *known, scene.noise, guess, self._seed)
-            if T_world_inner is not None:
-                T_world_cam[k] = T_world_inner
-        return T_world_cam
-
-    def _start_of(self, views: list[Observed], T_cam_world: Array, noise: NoiseModel) -> Start | None:
-        """Triangulate all tracks of posed views; None where too few of them have a depth."""
-        all_ids = np.unique(np.concatenate([o.ids for o in views]))
-        points = self._triangulate(views, T_cam_world, all_ids, noise)
-        good = self._passes(points)
-        if int(good.sum()) < MIN_POINTS:
-            return None
-        scale = 1.0 / float(np.median(points.xyz[good, 2]))
-        if not 0 < scale < np.inf:
-            return None
-        keyframes = []
-        for o, T in zip(views, invert_transform(T_cam_world), strict=True):
-            T[:3, 3] *= scale
-            keyframes.append(keyframe_of(o, T))
-        _, point, _, confidence, _ = gather_observations(views, all_ids[good])
-        mean = np.bincount(point, weights=confidence) / np.bincount(point)
-        return Start(keyframes, all_ids[good], scale * points.xyz[good], mean)
+        return self._geometry.start_of(views, T_cam_world, scene.noise if scene.alone.any() else expected)
 
     def _decide(self, views: list[Observed], T_world_cam: Array, noise: NoiseModel) -> Structure | None:
         """Adjust the start and the structures it may be mistaken for; None while several fit."""
@@ -438,26 +374,3 @@ class Initialiser:
             ]
             self._undecided.note_attempt(going_on)
         return structure
-
-    def _triangulate(
-        self, frames: list[Observed], T_cam_world: Array, ids: Ids, noise: NoiseModel
-    ) -> Triangulation:
-        view, point, xy, confidence, _ = gather_observations(frames, ids)
-        sigma = noise.sigma_px(confidence)
-        return triangulate(self._camera, T_cam_world, view, point, xy, sigma, len(ids))
-
-    def _passes(self, points: Triangulation) -> NDArray[np.bool_]:
-        return (
-            points.in_front
-            & (points.parallax_deg > _PARALLAX_SHARE * self._min_parallax_deg)
-            & (points.error_sigma < _MAX_ERROR_SIGMA)
-        )
-
-
-def _between(span: list[Observed]) -> list[int]:
-    """Which frames between the first and the last become keyframes: spread out, with an image if one has."""
-    inner = [k for k in range(1, len(span) - 1) if span[k].grey is not None] or [*range(1, len(span) - 1)]
-    if not inner:
-        return []
-    wanted = np.linspace(0, len(span) - 1, START_KEYFRAMES)[1:-1]
-    return sorted({min(inner, key=lambda k: abs(k - w)) for w in wanted.tolist()})

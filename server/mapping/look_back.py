@@ -17,12 +17,12 @@ from semcast.common.geometry import invert_transform, transform_points
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.bundle import optimise
 from semcast.server.mapping.bundle_problem import assemble_problem
-from semcast.server.mapping.initialiser import Start
 from semcast.server.mapping.kept_frames import Observed, keyframe_of, pose_of
 from semcast.server.mapping.new_landmarks import triangulate_tracks
 from semcast.server.mapping.observations import gather_observations
 from semcast.server.mapping.scene_depth import median_depth_of
 from semcast.server.mapping.settings import ReconstructionSettings
+from semcast.server.mapping.start_geometry import Start
 from semcast.server.mapping.track_ids import shared_rows
 from semcast.server.mapping.window import within_limit
 

@@ -16,7 +16,6 @@ from semcast.server.mapping.anchoring import anchor_tracks, resembles
 from semcast.server.mapping.bridging import Bridge
 from semcast.server.mapping.bundle_problem import BundleResult, BundleRunner
 from semcast.server.mapping.guessed_place import GuessedPlace
-from semcast.server.mapping.initialiser import Start
 from semcast.server.mapping.joining import may_join
 from semcast.server.mapping.kept_frames import Observed, colours_of
 from semcast.server.mapping.keyframe_images import ImagedMap, KeyframeImages, SeenFrom
@@ -34,6 +33,7 @@ from semcast.server.mapping.rolling_shutter import ImageFlow
 from semcast.server.mapping.scene_depth import usual_depth
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.sight import Sight
+from semcast.server.mapping.start_geometry import Start
 from semcast.server.mapping.state import MapUpdate
 from semcast.server.mapping.submap_placement import SubmapPlacement
 from semcast.server.mapping.track_ids import shared_rows

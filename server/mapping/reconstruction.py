@@ -12,7 +12,7 @@ from semcast.common.camera import Intrinsics
 from semcast.server.mapping.blank import result_of_nothing, shows_nothing
 from semcast.server.mapping.bundle_problem import BundleRunner
 from semcast.server.mapping.camera_motion import CameraMotion
-from semcast.server.mapping.initialiser import MIN_POINTS, Initialiser, Start
+from semcast.server.mapping.initialiser import Initialiser
 from semcast.server.mapping.kept_frames import backfill, observed_of
 from semcast.server.mapping.locator import RECOGNISED_CONFIDENCE, Locator
 from semcast.server.mapping.look_back import look_back
@@ -23,6 +23,7 @@ from semcast.server.mapping.rolling_shutter import ImageFlow, RollingShutter
 from semcast.server.mapping.scale_watch import ScaleWatch
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.sight import Sight
+from semcast.server.mapping.start_geometry import MIN_POINTS, Start
 from semcast.server.mapping.state import DecodedFrame, FrameResult, MapUpdate, TrackingState
 from semcast.server.mapping.submap_placement import SubmapPlacement
 from semcast.server.mapping.tracker import TrackedPose

@@ -17,10 +17,10 @@ from semcast.common.geometry import invert_transform, make_transform, rotation_a
 from semcast.server.mapping.bridging import Bridge, bridge
 from semcast.server.mapping.camera_motion import CameraMotion
 from semcast.server.mapping.guessed_place import GuessedPlace
-from semcast.server.mapping.initialiser import Start
 from semcast.server.mapping.known_end import place_by_end
 from semcast.server.mapping.scene_depth import median_depth, usual_depth
 from semcast.server.mapping.sight import Sight
+from semcast.server.mapping.start_geometry import Start
 from semcast.server.mapping.visual_gyroscope import VisualGyroscope
 from semcast.server.mapping.world_map import WorldMap
 

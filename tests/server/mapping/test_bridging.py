@@ -7,7 +7,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3, make_transform
 from semcast.server.mapping.bridging import bridge
 from semcast.server.mapping.camera_motion import CameraMotion
-from semcast.server.mapping.initialiser import Start
+from semcast.server.mapping.start_geometry import Start
 from semcast.server.mapping.world_map import Keyframe
 
 CAMERA = Intrinsics(fx=260, fy=260, cx=159.5, cy=119.5, width=320, height=240)

@@ -6,10 +6,10 @@ import pytest
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import make_transform, transform_points
 from semcast.server.geometry.weighting import NoiseModel
-from semcast.server.mapping.initialiser import Start
 from semcast.server.mapping.kept_frames import Observed, backfill, colours_of, keyframe_of, pose_of
 from semcast.server.mapping.look_back import look_back
 from semcast.server.mapping.settings import ReconstructionSettings
+from semcast.server.mapping.start_geometry import Start
 from semcast.server.mapping.world_map import WorldMap
 
 CAMERA = Intrinsics(fx=400.0, fy=400.0, cx=320.0, cy=240.0, width=640, height=480)

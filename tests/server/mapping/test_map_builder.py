@@ -11,12 +11,12 @@ from semcast.server.geometry.whereabouts import Whereabouts
 from semcast.server.mapping.bridging import Bridge
 from semcast.server.mapping.bundle import optimise
 from semcast.server.mapping.guessed_place import GuessedPlace
-from semcast.server.mapping.initialiser import Start
 from semcast.server.mapping.kept_frames import Observed
 from semcast.server.mapping.map_builder import MapBuilder
 from semcast.server.mapping.relocalisation import Place
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.sight import Sight
+from semcast.server.mapping.start_geometry import Start
 from semcast.server.mapping.state import DecodedFrame
 from semcast.server.mapping.world_map import Keyframe
 

@@ -17,11 +17,11 @@ from semcast.common.geometry import (
 )
 from semcast.server.mapping import reconstruction, settings
 from semcast.server.mapping.bundle import InlineBundle
-from semcast.server.mapping.initialiser import MIN_POINTS
 from semcast.server.mapping.locator import Locator
 from semcast.server.mapping.look_back import look_back
 from semcast.server.mapping.map_builder import MapBuilder
 from semcast.server.mapping.relocalisation import Place, Relocaliser
+from semcast.server.mapping.start_geometry import MIN_POINTS
 from semcast.server.mapping.state import TrackingState
 from semcast.server.mapping.submap_placement import SubmapPlacement
 

@@ -8,8 +8,8 @@ from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_se3, invert_transform, make_transform
 from semcast.server.mapping.camera_motion import CameraMotion
 from semcast.server.mapping.guessed_place import GuessedPlace
-from semcast.server.mapping.initialiser import Start
 from semcast.server.mapping.sight import Sight
+from semcast.server.mapping.start_geometry import Start
 from semcast.server.mapping.state import DecodedFrame
 from semcast.server.mapping.submap_placement import SubmapPlacement
 from semcast.server.mapping.world_map import Keyframe, WorldMap
