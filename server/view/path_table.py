@@ -62,6 +62,11 @@ class PathTable:
         return np.array([frame.frame_id for frame in self._frames], dtype=np.int64)
 
     @property
+    def newest_id(self) -> int:
+        """Id of the last frame, -1 where there is none."""
+        return self._frames[-1].frame_id if self._frames else -1
+
+    @property
     def times_ns(self) -> NDArray[np.int64]:
         """``(N,)`` recorded times of the frames."""
         return np.array([frame.t_source_ns for frame in self._frames], dtype=np.int64)

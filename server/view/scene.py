@@ -178,7 +178,10 @@ class Scene:
 
     def _insert_pose(self, frame_id: int, t_source_ns: int, T_world_cam: Array) -> None:
         T = np.asarray(T_world_cam, dtype=np.float64)
-        self._path.insert(frame_id, t_source_ns, T, is_after_gap=self._lost_since_pose)
+        # Of frames that are posed together only the first one comes after the gap.
+        is_after_gap = self._lost_since_pose and frame_id > self._path.newest_id
+        self._path.insert(frame_id, t_source_ns, T, is_after_gap=is_after_gap)
+        self._lost_since_pose &= not is_after_gap
 
     def update(self, update: MapUpdate) -> None:
         """Take what changed in the map."""

@@ -326,6 +326,17 @@ def test_a_gap_stays_when_the_frame_after_it_is_taken_back():
     assert [strip[:, 0].tolist() for strip in strips] == [[0.0, 1.0], [10.0, 11.0]]
 
 
+def test_frames_posed_together_after_a_gap_are_one_line_that_begins_after_it():
+    scene = Scene()
+    for k, T in enumerate((at(0), at(1), None, None, None, None)):
+        scene.add_frame(view(k, T))
+    # A later part of the map begins: frames of before it are told again, those that waited follow.
+    scene.add_frame(view(6, at(6), backfilled=tuple((k, k, at(k)) for k in (1, 3, 4, 5))))
+    scene.add_frame(view(7, at(7)))
+    (strips,) = scene.changes_since(Cursor()).segments.values()
+    assert [strip[:, 0].tolist() for strip in strips] == [[0.0, 1.0], [3.0, 4.0, 5.0, 6.0, 7.0]]
+
+
 def test_the_marker_is_shown_once_where_it_is_and_taken_away_where_it_tells_nothing_any_more():
     marker = Marker(np.array([[0.0, 0, 5], [1, 0, 5], [1, 1, 5], [0, 1, 5]]), "marker 7")
     scene, cursor = Scene(), Cursor()
