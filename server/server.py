@@ -236,7 +236,7 @@ class Server:
         self._end_of.note(message, decoded.arrival.camera)
         if decoded.frame is None:
             self.metrics.drop("lost_on_air" if decoded.arrival.received is None else "outage")
-            self._sessions.views.submit(missing_view(decoded, self.metrics.drops))
+            self._sessions.views.submit(missing_view(decoded, self._sessions.drops()))
             return
         if message.frame_id <= session.last_frame_id:
             self.metrics.drop("processed")
@@ -254,7 +254,7 @@ class Server:
 
         outcome = None
         with self._tracking:
-            outcome = session.process(decoded.frame, Arrival.of(decoded, self.metrics.drops), tell)
+            outcome = session.process(decoded.frame, Arrival.of(decoded, self._sessions.drops()), tell)
         if outcome is None:
             self.metrics.drop("track")
             return

@@ -113,6 +113,11 @@ class SuccessiveSessions:
         )
         return self.current
 
+    def drops(self) -> dict[str, int]:
+        """Return frames dropped since the present stream began, by reason: 0 where all were before it."""
+        now = self._metrics.drops
+        return {reason: max(0, now[reason] - self._drops_before.get(reason, 0)) for reason in now}
+
     def _new_reference(self, identity: StreamIdentity, *, goes_on: bool) -> Reference | None:
         """Return the reference for a camera; a server that ``goes_on`` does without one if need be."""
         folder = self._settings.reference
@@ -260,12 +265,8 @@ class SuccessiveSessions:
         complete, num_sent = self._end_of.complete, self._end_of.num_sent(session.identity.agent_epoch)
         if not complete:
             session.save_checkpoint()
-        return session.write_outputs(folder, self._drops(), complete=complete, num_sent=num_sent)
-
-    def _drops(self) -> dict[str, int]:
-        """Drops since the present stream began."""
-        now = self._metrics.drops
-        return {reason: n for reason in now if (n := now[reason] - self._drops_before.get(reason, 0)) > 0}
+        drops = {reason: count for reason, count in self.drops().items() if count}
+        return session.write_outputs(folder, drops, complete=complete, num_sent=num_sent)
 
     def _close_reference(self) -> None:
         reference, self._reference = self._reference, None

@@ -22,6 +22,7 @@ from semcast.server.export.outputs import write_ply
 from semcast.server.feedback import WINDOW
 from semcast.server.view.rerun_viewer import RerunStream
 from semcast.server.view.settings import ViewSettings
+from semcast.server.viewing import SuccessiveViews
 
 pytestmark = pytest.mark.xdist_group("real-time")
 
@@ -112,6 +113,33 @@ def test_each_start_of_the_agent_is_shown_in_a_recording_of_its_own(tmp_path, ai
         shown = (folder / "run.rrd").read_bytes()
         assert own in shown
         assert other not in shown
+
+
+def test_what_is_shown_of_a_start_counts_the_frames_that_it_lost_itself(tmp_path, air, monkeypatch):
+    submit, lost = SuccessiveViews.submit, {}
+
+    def noted(views, view, *args, **kwargs):
+        if view is not None:
+            lost.setdefault(running.server._sessions.current.identity.agent_epoch, []).append(
+                {path: n for path, n in view.scalars.items() if path.startswith("drops/")}
+            )
+        submit(views, view, *args, **kwargs)
+
+    monkeypatch.setattr(SuccessiveViews, "submit", noted)
+    running = air.serve(out=tmp_path, view=ViewSettings(view="file"))
+    first = air.agent(100)
+    first.stream([0])
+    first.send(1, digest="0" * 16)
+    running.wait_for_drop("codec")
+    first.stream([2])
+    first.close()
+    second = air.agent(200)
+    second.stream(range(2))
+    running.finish(stop=True)
+    assert lost == {
+        100: [{"drops/all": 0.0}, {"drops/all": 1.0, "drops/codec": 1.0}],
+        200: 2 * [{"drops/all": 0.0, "drops/codec": 0.0}],
+    }
 
 
 def test_a_new_start_that_cannot_be_shown_is_tracked_all_the_same(tmp_path, air, monkeypatch, caplog):
