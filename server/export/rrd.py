@@ -74,9 +74,12 @@ def _show(stream: RerunStream, data: RunData, images: Mapping[int, Path]) -> Non
     # By how far landmarks are from where the camera begins, a scene knows how large it is.
     scene.set_keyframes(data.frame_ids[:1], data.T_world_cam[:1])
     scene.add_landmarks(data.landmark_ids, data.xyz, data.rgb, data.confidence, np.zeros(0, dtype=np.int64))
-    for frame_id, t_ns, T_world_cam in zip(
-        data.frame_ids.tolist(), data.t_source_ns.tolist(), data.T_world_cam, strict=True
+    begins_part = np.diff(data.frame_submap, prepend=data.frame_submap[:1]) != 0
+    for frame_id, t_ns, T_world_cam, is_first in zip(
+        data.frame_ids.tolist(), data.t_source_ns.tolist(), data.T_world_cam, begins_part, strict=True
     ):
+        if is_first:
+            scene.interrupt_path()
         view = _view(data, frame_id, t_ns, T_world_cam, images.get(frame_id))
         scene.add_frame(view)
         if view.image is not None:

@@ -28,6 +28,8 @@ INLIER_COLOUR = (80, 230, 120)
 OTHER_COLOUR = (240, 120, 70)
 MARKER_COLOUR = (90, 170, 255)
 
+#: Where Rerun has the middle of the first pixel; ours is at 0.
+PIXEL_CENTRE = 0.5
 #: Entity of the dense cloud, one below it for each keyframe.
 DENSE = "world/dense"
 DENSE_POINT_SIZE = 1.3
@@ -171,11 +173,13 @@ class RerunStream:
         self._log_pinhole(0.3)
 
     def _log_pinhole(self, frustum_size: float) -> None:
+        camera = self._camera
         self._open().log(
             "world/camera/image",
             rr.Pinhole(
-                image_from_camera=self._camera.K,
-                resolution=[self._camera.width, self._camera.height],
+                focal_length=[camera.fx, camera.fy],
+                principal_point=[camera.cx + PIXEL_CENTRE, camera.cy + PIXEL_CENTRE],
+                resolution=[camera.width, camera.height],
                 camera_xyz=rr.ViewCoordinates.RDF,
                 image_plane_distance=frustum_size,
                 color=PATH_COLOUR,
@@ -320,7 +324,7 @@ class RerunStream:
         colours = np.where(picture.keypoint_inlier[:, None], INLIER_COLOUR, OTHER_COLOUR).astype(np.uint8)
         stream.log(
             "world/camera/image/keypoints",
-            rr.Points2D(picture.keypoints_xy + 0.5, colors=colours, radii=rr.Radius.ui_points(2.0)),
+            rr.Points2D(picture.keypoints_xy + PIXEL_CENTRE, colors=colours, radii=rr.Radius.ui_points(2.0)),
         )
         if picture.confidence_jpeg is not None:
             stream.log(
@@ -369,11 +373,11 @@ class RerunStream:
 def _set_time(stream: rr.RecordingStream, of: Row | Picture) -> None:
     """Let what is logged next be of a frame."""
     stream.set_time("frame", sequence=of.frame_id)
-    stream.set_time("source_time", duration=of.t_source_ns * 1e-9)
+    stream.set_time("source_time", duration=np.timedelta64(of.t_source_ns, "ns"))
 
 
 def _time_columns(rows: list[Row]) -> list[rr.TimeColumn]:
     return [
         rr.TimeColumn("frame", sequence=[row.frame_id for row in rows]),
-        rr.TimeColumn("source_time", duration=[row.t_source_ns * 1e-9 for row in rows]),
+        rr.TimeColumn("source_time", duration=np.array([row.t_source_ns for row in rows], "timedelta64[ns]")),
     ]

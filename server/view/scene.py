@@ -171,10 +171,14 @@ class Scene:
             self._insert_pose(frame_id, t_source_ns, T_world_cam)
         if view.T_world_cam is None:
             if view.state != MISSING:
-                self._lost_since_pose = len(self._path) > 0
+                self.interrupt_path()
             return
         self._insert_pose(view.frame_id, view.t_source_ns, view.T_world_cam)
         self._lost_since_pose = False
+
+    def interrupt_path(self) -> None:
+        """Begin a new line with the next pose: nothing tells how the camera came there."""
+        self._lost_since_pose = len(self._path) > 0
 
     def _insert_pose(self, frame_id: int, t_source_ns: int, T_world_cam: Array) -> None:
         T = np.asarray(T_world_cam, dtype=np.float64)

@@ -19,7 +19,7 @@ from semcast.common.geometry import invert_transform
 from semcast.common.run_folder import read_image_paths
 from semcast.server.export.colmap import write_colmap
 from semcast.server.export.formats import FORMATS, export_run
-from semcast.server.export.geometry import reprojection_errors_px
+from semcast.server.export.geometry import landmark_rows, reprojection_errors_px
 from semcast.server.export.nerfstudio import write_nerfstudio
 from semcast.server.export.poses import write_run_kitti, write_run_tum
 
@@ -27,6 +27,18 @@ from semcast.server.export.poses import write_run_kitti, write_run_tum
 def written(tmp_path, data, write_arc_run, keep="keyframes"):
     write_arc_run(tmp_path / "run", data, keep)
     return read_image_paths(tmp_path / "run")
+
+
+def read_rrd(file):
+    """Return what a Rerun recording holds: (entity, column) to its rows."""
+    import rerun as rr
+
+    at = {}
+    for chunk in rr.chunk.RrdReader(file).stream().to_chunks():
+        rows = chunk.to_record_batch()
+        for name in rows.schema.names:
+            at.setdefault((str(chunk.entity_path), name), []).extend(rows.column(name).to_pylist())
+    return at
 
 
 def test_pycolmap_reads_the_model_and_finds_the_same_reprojection_error(tmp_path, arc_run, write_arc_run):
@@ -292,25 +304,52 @@ def test_a_rerun_recording_is_made_of_a_run_whose_folder_has_no_name_in_text(
 def test_a_rerun_recording_that_is_made_is_looked_at_from_a_distance_of_the_maps_size(
     tmp_path, arc_run, write_arc_run
 ):
-    import rerun as rr
-
     data, sizes = arc_run(), []
     for factor in (1.0, 100.0):
         T_world_cam = data.T_world_cam.copy()
         T_world_cam[:, :3, 3] *= factor
         write_arc_run(tmp_path / "run", replace(data, T_world_cam=T_world_cam, xyz=factor * data.xyz))
         export_run(tmp_path / "run", "rrd", tmp_path / "made.rrd")
-        at = {}
-        for chunk in rr.chunk.RrdReader(tmp_path / "made.rrd").stream().to_chunks():
-            rows = chunk.to_record_batch()
-            for name in rows.schema.names:
-                at.setdefault((str(chunk.entity_path), name), []).extend(rows.column(name).to_pylist())
+        at = read_rrd(tmp_path / "made.rrd")
         (frustum,) = at["/world/camera/image", "Pinhole:image_plane_distance"][-1]
         eye, camera = (
             np.ravel(at[path, "Transform3D:translation"][0]) for path in ("/world/spectator", "/world/camera")
         )
         sizes.append((frustum, np.linalg.norm(eye - camera)))
     np.testing.assert_allclose(sizes[1], 100.0 * np.array(sizes[0]), rtol=1e-5)
+
+
+def test_landmarks_in_a_rerun_recording_that_is_made_are_seen_where_their_keypoints_are(
+    tmp_path, arc_run, write_arc_run
+):
+    data = arc_run()
+    write_arc_run(tmp_path / "run", data)
+    export_run(tmp_path / "run", "rrd", tmp_path / "made.rrd")
+    at = read_rrd(tmp_path / "made.rrd")
+    image_from_camera = np.reshape(at["/world/camera/image", "Pinhole:image_from_camera"][-1], (3, 3)).T
+    k = int(data.keyframe_ids[-1])
+    seen = data.observed_keyframe_ids == k
+    xyz = data.xyz[landmark_rows(data)[seen]]
+    T_cam_world = invert_transform(data.T_world_cam[data.frame_ids == k][0])
+    projected = (xyz @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]) @ image_from_camera.T
+    keypoints = at["/world/camera/image/keypoints", "Points2D:positions"][-1]
+    np.testing.assert_allclose(keypoints, projected[:, :2] / projected[:, 2:], atol=1e-3)
+    np.testing.assert_allclose(keypoints, data.observed_xy[seen] + 0.5, atol=1e-3)
+
+
+def test_a_rerun_recording_that_is_made_is_exact_in_time_and_has_a_line_for_each_part(
+    tmp_path, arc_run, write_arc_run
+):
+    data = arc_run()
+    times_ns = 1_764_550_000_123_456_789 + 100_000_001 * np.arange(len(data.frame_ids))
+    parts = np.where(np.arange(len(data.frame_ids)) < 4, 0, 1)
+    write_arc_run(tmp_path / "run", replace(data, t_source_ns=times_ns, frame_submap=parts), "all")
+    export_run(tmp_path / "run", "rrd", tmp_path / "made.rrd")
+    at = read_rrd(tmp_path / "made.rrd")
+    for entity in ("/world/camera", "/state", "/world/camera/image"):
+        assert [t.value for t in at[entity, "source_time"]] == times_ns.tolist(), entity
+    lines = at["/world/trajectory/0000", "LineStrips3D:strips"][-1]
+    assert [len(line) for line in lines] == [4, len(times_ns) - 4]
 
 
 @pytest.mark.parametrize("room", [0, 3000])
