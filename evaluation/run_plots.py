@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.errors import SourceError
+from semcast.common.metrics import DUPLICATE
 from semcast.common.run_folder import FRAMES_NAME, SUMMARY_NAME, TRAJECTORY_NAME
 from semcast.common.run_summary import read_summary
 from semcast.common.trajectory import Trajectory, read_tum
@@ -290,7 +291,8 @@ def timeline_title(run: RunToPlot) -> str:
     count = str(len(run.rows))
     if run.num_sent is not None and run.num_sent > len(run.rows):
         count += f" of {run.num_sent}"
-    dropped = ", ".join(f"{number} {reason}" for reason, number in sorted(run.drops.items()) if number)
+    drops = {reason: number for reason, number in sorted(run.drops.items()) if number and reason != DUPLICATE}
+    dropped = ", ".join(f"{number} {reason}" for reason, number in drops.items())
     posed = sum(row.posed for row in run.rows)
     return f"{run.name}: {count} frames{f' ({dropped})' if dropped else ''}, {posed} with a pose at once"
 

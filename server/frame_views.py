@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from semcast.common.codec import OUTAGE_GREY
+from semcast.common.metrics import DUPLICATE
 from semcast.server.decoder import DecodedArrival
 from semcast.server.frame_rows import FrameRow
 from semcast.server.mapping.state import DecodedFrame, FrameResult
@@ -82,8 +83,9 @@ def missing_view(decoded: DecodedArrival, drops: Mapping[str, int]) -> FrameView
 
 
 def _dropped(drops: Mapping[str, int]) -> dict[str, float]:
-    by_reason = {f"drops/{reason}": float(count) for reason, count in drops.items()}
-    return {"drops/all": float(sum(drops.values())), **by_reason}
+    """Return the counts in the plot of drops: of a frame that came twice nothing is lost."""
+    lost = {reason: float(count) for reason, count in drops.items() if reason != DUPLICATE}
+    return {"drops/all": sum(lost.values(), 0.0), **{f"drops/{reason}": n for reason, n in lost.items()}}
 
 
 def _known(scalars: Mapping[str, float | None]) -> dict[str, float]:

@@ -128,6 +128,15 @@ def test_a_run_is_described(run_folder):
     assert "tracked by time of arrival: 3.9 frames a second" in text
 
 
+def test_frames_that_came_twice_are_no_dropped_ones(run_folder):
+    (run_folder / "summary.json").write_text('{"drops": {"duplicate": 9, "superseded": 29, "too_old": 1}}')
+    text = text_of(run_folder)
+    assert "dropped frames: 29 superseded, 1 too_old\n" in text
+    assert "frames that came twice: 9\n" in text
+    (run_folder / "summary.json").write_text('{"drops": {"duplicate": 9}}')
+    assert "dropped frames" not in text_of(run_folder)
+
+
 def test_rows_that_a_killed_run_left_are_described_without_the_last_one(run_folder):
     assert "frames.jsonl: the last" not in text_of(run_folder)
     rows = run_folder / "frames.jsonl"

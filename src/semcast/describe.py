@@ -11,6 +11,7 @@ from typing import Any
 from semcast.common.camera_settings import HOW_TO_GIVE
 from semcast.common.errors import CheckpointError, SourceError
 from semcast.common.file_lock import is_locked
+from semcast.common.metrics import DUPLICATE
 from semcast.common.recorded_streams import RecordedStream, recorded_streams
 from semcast.common.recording_reader import RECORDING_METADATA, RecordingReader
 from semcast.common.ros_bag_files import is_ros_bag
@@ -228,8 +229,12 @@ def _figures(summary: dict[str, Any]) -> list[tuple[str, str]]:
     age = (summary.get("stage_ms") or {}).get("arrival_to_pose")
     if age:
         facts.append(("arrival to pose", f"p50 {age['p50']:.0f} ms, p95 {age['p95']:.0f} ms"))
-    if summary.get("drops"):
-        facts.append(("dropped frames", ", ".join(f"{n} {why}" for why, n in summary["drops"].items())))
+    drops = dict(summary.get("drops") or {})
+    num_repeated = drops.pop(DUPLICATE, 0)
+    if drops:
+        facts.append(("dropped frames", ", ".join(f"{n} {why}" for why, n in drops.items())))
+    if num_repeated:
+        facts.append(("frames that came twice", str(num_repeated)))
     return facts
 
 

@@ -108,7 +108,8 @@ def test_missing_frames_are_marked(tmp_path):
 
 def test_the_title_says_how_many_frames_were_sent_and_where_the_others_went(tmp_path):
     rows = [row(k, posed=k > 0) for k in range(3)]
-    summary = {"frames": {"source": 20, "sent": 7}, "drops": {"superseded": 3, "lost": 1, "damaged": 0}}
+    drops = {"superseded": 3, "lost": 1, "damaged": 0, "duplicate": 2}
+    summary = {"frames": {"source": 20, "sent": 7}, "drops": drops}
     known = RunToPlot.read(write_run(tmp_path / "known", rows, summary), None)
     assert timeline_title(known) == "known: 3 of 7 frames (1 lost, 3 superseded), 2 with a pose at once"
     cut_off = RunToPlot.read(write_run(tmp_path / "cut_off", rows), None)

@@ -51,6 +51,11 @@ def test_what_was_lost_on_the_air_leaves_the_image_before_it(missing):
     assert view.scalars == {"link/snr_set_db": 3.0, "drops/all": 1.0, "drops/lost_on_air": 1.0}
 
 
+def test_a_frame_that_came_twice_is_no_drop(missing):
+    scalars = missing_view(missing(None), {"duplicate": 9, "lost_on_air": 1}).scalars
+    assert scalars == {"link/snr_set_db": 3.0, "drops/all": 1.0, "drops/lost_on_air": 1.0}
+
+
 def test_what_is_not_finite_is_not_plotted(missing):
     decoded = missing(object())
     decoded.arrival.snr_db, decoded.arrival.snr_db_set = np.inf, np.nan
