@@ -56,6 +56,8 @@ The map
     thinning          what goes when the map reaches its limits
     keyframe_images   images of keyframes, kept to look for landmarks by how they looked there
     scale_watch       whether keyframes hold the scale of those before
+    contradiction     whether tracks alone tell another motion than the map
+    rebuilding        the newest keyframes are built anew where they do
     map_arrays        checks the arrays of a checkpoint
     map_update        what of the map goes out to those who follow it
 

@@ -120,12 +120,12 @@ def local_scales(result: BundleResult) -> Array:
     depth = float(
         np.median(depths_in(invert_transform(problem.T_world_cam)[problem.view], problem.xyz[problem.point]))
     )
-    before, after = _ways(problem.T_world_cam), _ways(result.T_world_cam)
+    before, after = ways(problem.T_world_cam), ways(result.T_world_cam)
     is_told = ~problem.fixed & (before > _LEAST_WAY * depth)
     return np.where(is_told, after / np.where(is_told, before, 1.0), 1.0)
 
 
-def _ways(T_world_cam: Array) -> Array:
+def ways(T_world_cam: Array) -> Array:
     """Sum of the distances, ``(K,)``, from each of ``(K, 4, 4)`` poses to those before and after it."""
     ways = np.zeros(len(T_world_cam))
     steps = np.linalg.norm(np.diff(T_world_cam[:, :3, 3], axis=0), axis=1)

@@ -72,12 +72,16 @@ def adjusted(problem: BundleProblem) -> Structure:
     """Adjust one of the structures to all observations."""
     result = optimise(problem)
     # All observations anew: those that could not be used at the start count as well.
-    residual, _ = residuals_px(problem, result.T_world_cam, result.xyz)
+    cost = cost_of(replace(problem, T_world_cam=result.T_world_cam, xyz=result.xyz))
+    return Structure(result.T_world_cam, result.xyz, cost, result.ok)
+
+
+def cost_of(problem: BundleProblem) -> float:
+    """Sum of squared residuals in standard deviations, each cut off, of a structure as it is."""
+    residual, _ = residuals_px(problem, problem.T_world_cam, problem.xyz)
     error = whitened(problem.edge, np.nan_to_num(residual, nan=1e6))
     size = np.linalg.norm(error, axis=1) / problem.sigma_px
-    return Structure(
-        result.T_world_cam, result.xyz, float((np.minimum(size, _CUT_SIGMAS) ** 2).sum()), result.ok
-    )
+    return float((np.minimum(size, _CUT_SIGMAS) ** 2).sum())
 
 
 def decide(

@@ -15,6 +15,7 @@ from semcast.server.mapping.adjustment import apply_result, place_left_out
 from semcast.server.mapping.anchoring import anchor_tracks, resembles
 from semcast.server.mapping.bridging import Bridge
 from semcast.server.mapping.bundle_problem import BundleResult, BundleRunner
+from semcast.server.mapping.contradiction import Contradiction
 from semcast.server.mapping.guessed_place import GuessedPlace
 from semcast.server.mapping.joining import may_join
 from semcast.server.mapping.kept_frames import Observed, colours_of
@@ -22,10 +23,10 @@ from semcast.server.mapping.keyframe_images import ImagedMap, KeyframeImages, Se
 from semcast.server.mapping.keyframe_rule import KeyframeCues, median_flow_px, wants_keyframe
 from semcast.server.mapping.late_readout import put_map_right
 from semcast.server.mapping.loop_closure import Loop, LoopFinder, LoopView, share_out
-from semcast.server.mapping.map_update import update_of
 from semcast.server.mapping.new_landmarks import add_landmarks
 from semcast.server.mapping.pose_covariance import pose_covariance
 from semcast.server.mapping.readout_watch import ReadoutWatch
+from semcast.server.mapping.rebuilding import put_straight
 from semcast.server.mapping.recall import recall_landmarks
 from semcast.server.mapping.relocalisation import Place, Relocaliser, submap_similarity
 from semcast.server.mapping.revisit import Revisit, find_revisit, old_sigma_px, place_anew
@@ -34,7 +35,6 @@ from semcast.server.mapping.scene_depth import usual_depth
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.start_geometry import Start
-from semcast.server.mapping.state import MapUpdate
 from semcast.server.mapping.submap_placement import SubmapPlacement
 from semcast.server.mapping.track_ids import shared_rows
 from semcast.server.mapping.tracks import TrackTable
@@ -124,6 +124,7 @@ class MapBuilder:
         """Make a submap the current one."""
         self._recognised: int | None = None
         self.loops = LoopFinder(self._camera, self.relocaliser, self._settings.seed)
+        self._contradiction = Contradiction(self._camera, self._settings.seed)
         self.submap = submap
 
     def go_on_from(self, place: Place) -> None:
@@ -411,6 +412,16 @@ class MapBuilder:
         self._submit(start=True)
         self.collect(wait=True)
 
+    def put_straight(self, image: NDArray[np.uint8]) -> list[Keyframe]:
+        """Build the newest keyframes anew where their tracks contradict the map; those that have moved."""
+        noise = self.noise.model
+        moved = put_straight(self._contradiction, self._mapped, noise, self._settings, settle=self.finish)
+        if moved:
+            self._add_landmarks(image)
+            self._submit()
+            self.collect(wait=True)
+        return moved
+
     def adjust_whole(self) -> int:
         """Adjust all keyframes with all they see, and say how many. Takes seconds where there are many."""
         self.finish()
@@ -477,15 +488,6 @@ class MapBuilder:
         self.world.revisits[self.world.keyframes[-1].frame_id] = place.keyframe_id
         self._on_moved(scale)
         return scale
-
-    def take_update(self, map_epoch: int) -> MapUpdate | None:
-        """What changed in the map since this was last called, None when nothing did."""
-        changes = self.world.take_changes()
-        return update_of(self.world, changes, map_epoch) if any(map(len, changes)) else None
-
-    def whole(self, map_epoch: int) -> MapUpdate:
-        """All landmarks and keyframes, whether they changed or not."""
-        return update_of(self.world, self.world.everything(), map_epoch)
 
     def pose_covariance(self, covariance_in_map: Array | None, T_world_cam: Array) -> Array | None:
         """Covariance of a frame in the current submap, ``(6, 6)`` or None: see ``pose_covariance``."""

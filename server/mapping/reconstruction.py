@@ -18,6 +18,7 @@ from semcast.server.mapping.locator import RECOGNISED_CONFIDENCE, Locator
 from semcast.server.mapping.look_back import look_back
 from semcast.server.mapping.map_arrays import RunState
 from semcast.server.mapping.map_builder import MapBuilder
+from semcast.server.mapping.map_update import update_of
 from semcast.server.mapping.readout import Readout
 from semcast.server.mapping.rolling_shutter import ImageFlow, RollingShutter
 from semcast.server.mapping.scale_watch import ScaleWatch
@@ -39,6 +40,8 @@ Ids = NDArray[np.int64]
 _MIN_USABLE_SHARE = 0.5
 #: Keyframes between two attempts to recognise an older submap.
 _JOIN_INTERVAL = 3
+#: Keyframes that tell the motion of a camera whose path was put right.
+_NUM_MOTION = 4
 #: Share of the landmarks in sight that must agree with a pose found without a prior.
 _MIN_SHARE_WHEN_LOST = 0.5
 
@@ -230,12 +233,24 @@ class Reconstruction:
             pose = self._improved(sight, pose)
             tracks.refill(sight)
             self._map.make_keyframe(sight, tracks, pose.T_world_cam)
+            self._put_straight(frame)
             self._scale.look(self._map.world, self._map.noise.model)
             self._frames_since_keyframe = 0
             self._lap("map", since)
             pose = pose.with_unit(self._try_to_join(sight, pose.T_world_cam))
             pose = pose.with_unit(self._map.place_again(self._placement))
         return self._result(frame, self._last_pose(), pose, is_keyframe=is_keyframe)
+
+    def _put_straight(self, frame: DecodedFrame) -> None:
+        """Build the newest keyframes anew where the map has gone wrong, and let the camera have moved so."""
+        moved = self._map.put_straight(frame.image)
+        if moved:
+            logger.info("frame %d: the map went wrong since frame %d", frame.frame_id, moved[0].frame_id)
+            self._motion.reset()
+            for k in moved[-_NUM_MOTION:]:
+                self._motion.observe(
+                    k.frame_id, k.t_source_ns, k.T_world_cam, self._map.world.landmarks.xyz_of(k.ids)
+                )
 
     def _improved(self, sight: Sight, pose: TrackedPose) -> TrackedPose:
         """Take drift out of a keyframe to be: out of its tracks, and where the camera has been before."""
@@ -420,11 +435,14 @@ class Reconstruction:
 
     def take_map_update(self) -> MapUpdate | None:
         """What changed in the map since this was last called, None when nothing did."""
-        return self._map.take_update(self._map_epoch)
+        world = self._map.world
+        changes = world.take_changes()
+        return update_of(world, changes, self._map_epoch) if any(map(len, changes)) else None
 
     def whole_map(self) -> MapUpdate:
         """The map as one update, whatever was taken before."""
-        return self._map.whole(self._map_epoch)
+        world = self._map.world
+        return update_of(world, world.everything(), self._map_epoch)
 
     def conclude(self) -> int:
         """Adjust the whole map of a stream that has ended, if settings want it; the number of keyframes."""

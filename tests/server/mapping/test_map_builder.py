@@ -13,6 +13,7 @@ from semcast.server.mapping.bundle import optimise
 from semcast.server.mapping.guessed_place import GuessedPlace
 from semcast.server.mapping.kept_frames import Observed
 from semcast.server.mapping.map_builder import MapBuilder
+from semcast.server.mapping.map_update import update_of
 from semcast.server.mapping.relocalisation import Place
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.sight import Sight
@@ -276,9 +277,9 @@ def test_an_update_after_a_join_has_the_poses_of_all_frames(builder):
     add_part(builder, 1, 4, 40, seed=1)
     for k in (3, 2, 1, 0, 43, 41):
         builder.world.add_frame(50 + k, k, pose(0.01 * k, angle=0.3))
-    builder.take_update(0)
+    builder.world.take_changes()
     builder.world.transform_submap(1, 0, 1.5, pose(2.0, angle=0.1))
-    update = builder.take_update(0)
+    update = update_of(builder.world, builder.world.take_changes(), 0)
     assert update.frame_ids.tolist() == [0, 1, 2, 3, 40, 41, 42, 43, 50, 51, 52, 53, 91, 93]
     for frame_id, T_world_cam in zip(update.frame_ids.tolist(), update.frame_poses, strict=True):
         np.testing.assert_allclose(T_world_cam, builder.world.pose_of_frame(frame_id), atol=1e-12)

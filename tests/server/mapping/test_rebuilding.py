@@ -1,0 +1,82 @@
+"""The newest keyframes of a map that went wrong, built anew."""
+
+import numpy as np
+import pytest
+from bent_map import CAMERA, FIRST_BENT, NUM_KEYFRAMES, bent_poses, make_map, true_poses
+
+from semcast.common.geometry import invert_transform, make_transform, rotation_angle_deg
+from semcast.server.geometry.weighting import NoiseModel
+from semcast.server.mapping.keyframe_images import ImagedMap, KeyframeImages
+from semcast.server.mapping.rebuilding import bring_in, rebuild
+from semcast.server.mapping.settings import ReconstructionSettings
+
+NOISE = NoiseModel(0.3, 0.0)
+
+
+def rebuilt(world, submap=0):
+    return rebuild(ImagedMap(CAMERA, world, KeyframeImages(3), submap), NOISE, ReconstructionSettings())
+
+
+def errors(poses):
+    """Largest distance and turn between ``poses`` by frame id and the truth."""
+    truth = true_poses()
+    off = [invert_transform(truth[k // 2]) @ T for k, T in poses.items()]
+    return max(np.linalg.norm(T[:3, 3]) for T in off), max(rotation_angle_deg(T[:3, :3]) for T in off)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_path_that_was_taken_for_a_turn_is_put_right(seed):
+    world = make_map(bent_poses(), seed=seed)
+    away, turned_deg = errors(world.poses)
+    assert away > 0.3
+    assert turned_deg > 10.0
+    bring_in(world, rebuilt(world), 0)
+    away, turned_deg = errors(world.poses)
+    assert away < 0.02
+    assert turned_deg < 0.5
+
+
+def test_a_right_map_stays():
+    assert rebuilt(make_map(true_poses())) is None
+
+
+def test_the_unit_is_that_of_landmarks_the_first_keyframes_saw():
+    world = make_map(bent_poses())
+    found = rebuilt(world)
+    since = min(found.T_world_cam)
+    assert since < 2 * FIRST_BENT
+    for keyframe in world.keyframes:
+        T = keyframe.T_world_cam
+        world.move_keyframe(keyframe.frame_id, make_transform(T[:3, :3], 3.0 * T[:3, 3]))
+    world.move_landmarks(world.landmarks.ids.copy(), 3.0 * world.landmarks.xyz)
+    in_larger_unit = rebuilt(world)
+    for frame_id, T in in_larger_unit.T_world_cam.items():
+        np.testing.assert_allclose(T[:3, 3], 3.0 * found.T_world_cam[frame_id][:3, 3], atol=0.02)
+
+
+def test_landmarks_move_or_go_and_frames_take_over_the_scale():
+    world = make_map(bent_poses())
+    newest_id = world.keyframes[-1].frame_id
+    world.frames[newest_id + 1] = (newest_id, make_transform(np.eye(3), (0.01, 0.0, 0.0)))
+    truth = world.landmarks.xyz.copy()
+    is_seen_late = truth[:, 0] > 1.6
+    world.move_landmarks(world.landmarks.ids[is_seen_late], truth[is_seen_late] + 0.5)
+    old, young = 5001, 5002
+    xyz, rgb = np.ones((2, 3)), np.zeros((2, 3), np.uint8)
+    world.add_landmarks(np.array([old, young]), xyz, rgb, np.ones(2), 0, np.array([-2, 2 * FIRST_BENT]))
+    found = rebuilt(world)
+    bring_in(world, found, 0)
+    assert old in world.landmarks.ids, "that of an older keyframe stays"
+    assert young not in world.landmarks.ids
+    known = found.ids[np.isin(found.ids, world.landmarks.ids)]
+    off = np.linalg.norm(world.landmarks.xyz_of(known) - truth[known // 2], axis=1)
+    assert np.percentile(off, 90) < 0.05
+    step = np.linalg.norm(world.frames[newest_id + 1][1][:3, 3])
+    assert step == pytest.approx(0.01 / 0.4, rel=0.2), "in a unit that is so many times as large"
+
+
+def test_keyframes_that_share_too_little_are_left_alone():
+    world = make_map(bent_poses())
+    for number, keyframe in enumerate(world.keyframes):
+        keyframe.drop_observations(keyframe.ids % NUM_KEYFRAMES != number)
+    assert rebuilt(world) is None
