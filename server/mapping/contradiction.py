@@ -38,8 +38,10 @@ _WORSE = 0.2
 _NUM_PAIRS, _MIN_PAIRS = 4, 3
 #: Iterations of a search.
 _ITERATIONS = 100
-#: Keyframes that pass without a look where nothing better was found.
+#: Keyframes that pass without a look where nothing better was found; each time in a row twice as many.
 _PAUSE = 6
+#: And so many at most.
+_MAX_PAUSE = 192
 
 
 class Contradiction:
@@ -54,7 +56,7 @@ class Contradiction:
         self._camera = camera
         self._seed = seed
         self._said: deque[bool] = deque(maxlen=_NUM_PAIRS)
-        self._pause = 0
+        self._pause = self._vain_pause = 0
 
     def look(self, world: WorldMap, submap: int) -> bool:
         """Look at the newest keyframe of a submap; whether it and those before it are contradicted."""
@@ -70,7 +72,8 @@ class Contradiction:
     def note(self, *, was_right: bool) -> None:
         """Note that the map was put right, or that nothing was found to be better."""
         self._said.clear()
-        self._pause = 0 if was_right else _PAUSE
+        self._vain_pause = 0 if was_right else min(max(_PAUSE, 2 * self._vain_pause), _MAX_PAUSE)
+        self._pause = self._vain_pause
 
     def _says(self, world: WorldMap, first: Keyframe, second: Keyframe) -> bool | None:
         """Whether tracks of two keyframes contradict their poses; None where too few tell."""

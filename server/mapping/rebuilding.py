@@ -34,8 +34,10 @@ Ids = NDArray[np.int64]
 
 #: Keyframes that are built anew, at most.
 _NUM_KEYFRAMES = 20
-#: Tracks that the oldest of them shares with the newest.
+#: Tracks that the first view of what they show shares with the newest keyframe,
 _MIN_SHARED = 60
+#: and keyframes from one to the other, both counted, at least.
+_MIN_SPAN = 3
 #: How many times what fits best the map must cost.
 _CLEAR_RATIO = 1.3
 #: Landmarks of the first keyframes that tell the unit, at least.
@@ -127,6 +129,8 @@ def _better_start(
     shared = [len(shared_rows(o.ids, history[-1].ids)[0]) for o in history]
     reference = next(k for k, num in enumerate(shared) if num >= _MIN_SHARED or k == len(history) - 1)
     span = list(history[reference:])
+    if len(span) < _MIN_SPAN:
+        return None
     scene, ids = _motion(camera, span[0], span[-1], noise, settings)
     if scene is None or scene.motion.is_rotation:
         return None

@@ -53,5 +53,10 @@ def test_where_nothing_better_was_found_it_is_asked_again_later():
     watch.note(was_right=False)
     asked = [watch.look(world, 0) for _ in range(12)]
     assert asked == [False] * 8 + [True] * 4, "six keyframes without a look, and three that agree"
+    watch.note(was_right=False)
+    assert [watch.look(world, 0) for _ in range(15)] == [False] * 14 + [True], "twice as many"
     watch.note(was_right=True)
     assert [watch.look(world, 0) for _ in range(3)] == [False, False, True]
+    for _ in range(2000):
+        watch.note(was_right=False)
+    assert sum(watch.look(world, 0) for _ in range(200)) > 1, "but not for ever"
