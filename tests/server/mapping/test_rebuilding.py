@@ -1,11 +1,16 @@
 """The newest keyframes of a map that went wrong, built anew."""
 
+import logging
+
 import numpy as np
 import pytest
 from bent_map import CAMERA, FIRST_BENT, NUM_KEYFRAMES, bent_poses, make_map, true_poses
+from drawn_boards import ate_percent, frame_of, make, render, sideways
 
 from semcast.common.geometry import invert_transform, make_transform, rotation_angle_deg
 from semcast.server.geometry.weighting import NoiseModel
+from semcast.server.mapping import rebuilding, reconstruction
+from semcast.server.mapping.contradiction import Contradiction
 from semcast.server.mapping.keyframe_images import ImagedMap, KeyframeImages
 from semcast.server.mapping.rebuilding import bring_in, rebuild
 from semcast.server.mapping.settings import ReconstructionSettings
@@ -80,3 +85,26 @@ def test_keyframes_that_share_too_little_are_left_alone():
     for number, keyframe in enumerate(world.keyframes):
         keyframe.drop_observations(keyframe.ids % NUM_KEYFRAMES != number)
     assert rebuilt(world) is None
+
+
+def test_a_running_reconstruction_goes_on_from_what_was_built_anew(monkeypatch, caplog):
+    asked = []
+
+    def look(self, world, submap):
+        asked.append(world.keyframes[-1].frame_id)
+        return len(asked) % 2 == 0
+
+    monkeypatch.setattr(Contradiction, "look", look)
+    monkeypatch.setattr(rebuilding, "_CLEAR_RATIO", 0.0)  # what is found takes the place of a right map
+    truth, core = sideways(40), make()
+    with caplog.at_level(logging.INFO, logger=reconstruction.logger.name):
+        results = [core.process(frame_of(k, render(T))) for k, T in enumerate(truth)]
+    told = [r.getMessage() for r in caplog.records if r.name == reconstruction.logger.name]
+    rebuilt_at = asked[1::2]
+    assert len(rebuilt_at) >= 2
+    for frame_id in rebuilt_at:
+        assert any(text.startswith(f"frame {frame_id}: the map went wrong since frame") for text in told)
+    assert all(r.T_world_cam is not None for r in results[rebuilt_at[0] :])
+    at_once = {r.frame_id: r.T_world_cam for r in results if r.T_world_cam is not None}
+    assert ate_percent(at_once, truth) < 1.0
+    assert ate_percent(core.final_trajectory(), truth) < 0.5
