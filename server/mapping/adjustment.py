@@ -120,12 +120,23 @@ def local_scales(result: BundleResult) -> Array:
     depth = float(
         np.median(depths_in(invert_transform(problem.T_world_cam)[problem.view], problem.xyz[problem.point]))
     )
-    before, after = ways(problem.T_world_cam), ways(result.T_world_cam)
-    is_told = ~problem.fixed & (before > _LEAST_WAY * depth)
+    return np.where(problem.fixed, 1.0, scales_around(problem.T_world_cam, result.T_world_cam, depth))
+
+
+def scales_around(T_world_before: Array, T_world_after: Array, depth: float) -> Array:
+    """By how much the map was scaled around poses that were moved, ``(K,)``, see ``local_scales``.
+
+    Args:
+        T_world_before: ``(K, 4, 4)`` in order of time.
+        T_world_after: The same, moved.
+        depth: How far away the scene was: where distances are next to nothing against it, the factor is 1.
+    """
+    before, after = _ways(T_world_before), _ways(T_world_after)
+    is_told = before > _LEAST_WAY * depth
     return np.where(is_told, after / np.where(is_told, before, 1.0), 1.0)
 
 
-def ways(T_world_cam: Array) -> Array:
+def _ways(T_world_cam: Array) -> Array:
     """Sum of the distances, ``(K,)``, from each of ``(K, 4, 4)`` poses to those before and after it."""
     ways = np.zeros(len(T_world_cam))
     steps = np.linalg.norm(np.diff(T_world_cam[:, :3, 3], axis=0), axis=1)

@@ -5,6 +5,7 @@ The map competes with what is found: it too may only need to be let loose. The f
 is, and the unit is that of the landmarks it saw: from before the map went wrong, or the least bent.
 """
 
+from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -15,13 +16,14 @@ from semcast.common.camera import Intrinsics
 from semcast.common.geometry import interpolate_pose, invert_transform, make_transform, transform_points
 from semcast.server.geometry.projection import depths_in
 from semcast.server.geometry.weighting import NoiseModel, fuse_confidence
-from semcast.server.mapping.adjustment import ways
+from semcast.server.mapping.adjustment import scales_around
 from semcast.server.mapping.ambiguity import cost_of, decide
 from semcast.server.mapping.contradiction import Contradiction
 from semcast.server.mapping.hypotheses import problem_of
 from semcast.server.mapping.kept_frames import Observed, pose_of
 from semcast.server.mapping.keyframe_images import ImagedMap
 from semcast.server.mapping.look_back import look_back
+from semcast.server.mapping.scene_depth import median_depth
 from semcast.server.mapping.scene_motion import SceneMotion, motion_of_scene
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.start_alignment import aligned_views
@@ -217,17 +219,23 @@ def _unit(world: WorldMap, start: Start, T_world_first: Array) -> float | None:
 
 def bring_in(world: WorldMap, rebuilt: Rebuilt, submap: int) -> None:
     """Bring it into the map it was made from: landmarks since its first keyframe that it does not know go."""
-    frame_ids = list(rebuilt.T_world_cam)
-    before = np.stack([world.poses[k] for k in frame_ids])
-    after = np.stack([rebuilt.T_world_cam[k] for k in frame_ids])
-    for frame_id, T_world_cam in rebuilt.T_world_cam.items():
-        world.move_keyframe(frame_id, T_world_cam)
-        keyframe = world.keyframe(frame_id)
-        if keyframe is not None:
-            keyframe.refuted = np.zeros(0, np.int64)
-    way = ways(before)
-    scale = np.where(way > 0.0, ways(after) / np.where(way > 0.0, way, 1.0), 1.0)
-    world.rescale_frames(dict(zip(frame_ids, scale.tolist(), strict=True)))
+    moved = [k for k in world.keyframes_of(submap) if k.frame_id in rebuilt.T_world_cam]
+    before = np.stack([k.T_world_cam for k in moved])
+    after = np.stack([rebuilt.T_world_cam[k.frame_id] for k in moved])
+    scale = scales_around(before, after, median_depth(world, moved[0])).tolist()
+    frame_ids = [k.frame_id for k in moved]
+    factor = dict(zip(frame_ids, scale, strict=True))
+    for keyframe, T_world_cam in zip(moved, after, strict=True):
+        world.move_keyframe(keyframe.frame_id, T_world_cam)
+        keyframe.refuted = np.zeros(0, np.int64)
+    mine = {k for k, part in world.submap_of.items() if part == submap and k > frame_ids[0]}
+    for frame_id in mine - factor.keys():  # thinned out: they go with the one before them
+        row = bisect_left(frame_ids, frame_id) - 1
+        T_before_thinned = invert_transform(before[row]) @ world.poses[frame_id]
+        T_before_thinned[:3, 3] *= scale[row]
+        world.move_keyframe(frame_id, after[row] @ T_before_thinned)
+        factor[frame_id] = scale[row]
+    world.rescale_frames(factor)
     world.move_landmarks(rebuilt.ids, rebuilt.xyz)
     marks = world.landmarks
     is_mine = (marks.submap == submap) & (marks.born >= frame_ids[0])

@@ -108,3 +108,32 @@ def test_a_running_reconstruction_goes_on_from_what_was_built_anew(monkeypatch, 
     at_once = {r.frame_id: r.T_world_cam for r in results if r.T_world_cam is not None}
     assert ate_percent(at_once, truth) < 1.0
     assert ate_percent(core.final_trajectory(), truth) < 0.5
+
+
+def test_frames_stay_near_keyframes_where_the_map_took_the_whole_way_for_a_turn():
+    poses = bent_poses()
+    rng = np.random.default_rng(0)
+    for T in poses[FIRST_BENT:]:
+        T[:3, 3] = poses[FIRST_BENT - 1][:3, 3] + 1e-5 * rng.standard_normal(3)
+    world = make_map(poses)
+    middle_id = 2 * (FIRST_BENT + 3)
+    world.frames[middle_id + 1] = (middle_id, make_transform(np.eye(3), (0.002, 0.0, 0.0)))
+    bring_in(world, rebuilt(world), 0)
+    assert errors(world.poses)[0] < 0.05
+    step = np.linalg.norm(world.frames[middle_id + 1][1][:3, 3])
+    assert step == pytest.approx(0.002), "how short ways change is chance"
+
+
+def test_keyframes_that_were_thinned_out_go_with_those_before_them():
+    world = make_map(bent_poses())
+    thinned_ids = [2 * (NUM_KEYFRAMES - 2), 2 * (NUM_KEYFRAMES - 4)]
+    world.keyframes = [k for k in world.keyframes if k.frame_id not in thinned_ids]
+    before = {k: world.poses[k] for k in thinned_ids}
+    world.take_changes()
+    bring_in(world, rebuilt(world), 0)
+    assert set(thinned_ids) < set(world.take_changes().keyframes.tolist())
+    for frame_id, T_world_cam in before.items():
+        assert errors({frame_id: T_world_cam})[0] > 0.25
+        away, turned_deg = errors({frame_id: world.poses[frame_id]})
+        assert away < 0.03
+        assert turned_deg < 2.5
