@@ -237,7 +237,7 @@ class Reconstruction:
             self._scale.look(self._map.world, self._map.noise.model)
             self._frames_since_keyframe = 0
             self._lap("map", since)
-            pose = pose.with_unit(self._try_to_join(sight, pose.T_world_cam))
+            pose = pose.with_unit(self._try_to_join(sight))
             pose = pose.with_unit(self._map.place_again(self._placement))
         return self._result(frame, self._last_pose(), pose, is_keyframe=is_keyframe)
 
@@ -381,15 +381,18 @@ class Reconstruction:
             self._moves_to(sight.frame.frame_id, sight.frame.t_source_ns, pose.T_world_cam, grown.ids)
         return self._result(sight.frame, newest, pose, is_keyframe=True, backfilled=backfilled)
 
-    def _try_to_join(self, sight: Sight, T_world_cam: Array) -> float:
+    def _try_to_join(self, sight: Sight) -> float:
         """Look from time to time whether an older submap is in sight again; the factor on lengths, else 1."""
         self._keyframes_since_join += 1
         if not self._map.other_submaps() or self._keyframes_since_join < _JOIN_INTERVAL:
             return 1.0
         since = time.perf_counter_ns()
         self._keyframes_since_join = 0
-        place = self._map.recognise_other_submap(sight)
-        scale = None if place is None else self._map.join(place, T_world_cam, self._tracks)
+        # Not by the pose it was tracked at: the map may have been built anew since.
+        place, T_world_cam = self._map.recognise_other_submap(sight), self._last_pose()
+        scale = None
+        if place is not None and T_world_cam is not None:
+            scale = self._map.join(place, T_world_cam, self._tracks)
         if scale is not None:
             logger.info("frame %d: submaps are joined", sight.frame.frame_id)
         self._lap("relocalise", since)

@@ -178,6 +178,30 @@ def test_a_new_map_joins_the_old_one_when_it_comes_into_view(caplog, monkeypatch
     assert ate_percent(trajectory, truth) < 1.0
 
 
+def test_parts_are_joined_by_where_the_camera_is_once_its_own_part_was_built_anew(room, monkeypatch):
+    joined_at = []
+
+    def put_straight(builder, image):
+        newest = builder.world.keyframes[-1]
+        step = make_transform(exp_so3((0.0, 0.002, 0.0)), (0.01, 0.0, 0.0))
+        builder.world.move_keyframe(newest.frame_id, newest.T_world_cam @ step)
+        return [newest]
+
+    def join(builder, place, T_world_cam, tracks):
+        joined_at.append((T_world_cam, builder.world.keyframes[-1].T_world_cam))
+
+    monkeypatch.setattr(MapBuilder, "put_straight", put_straight)
+    monkeypatch.setattr(MapBuilder, "other_submaps", lambda builder: {7})
+    monkeypatch.setattr(MapBuilder, "recognise_other_submap", lambda builder, sight: object())
+    monkeypatch.setattr(MapBuilder, "join", join)
+    core = make()
+    for k, image in enumerate(room[1]):
+        core.process(frame_of(k, image))
+    assert joined_at
+    for asked, now in joined_at:
+        np.testing.assert_array_equal(asked, now)
+
+
 def test_a_place_where_the_camera_cannot_be_joins_nothing(caplog, monkeypatch):
     asked = []
     monkeypatch.setattr(map_builder, "may_join", lambda *a, **k: asked.append((*a, k)) or False)
