@@ -420,6 +420,7 @@ class MapBuilder:
             self._add_landmarks(image)
             self._submit()
             self.collect(wait=True)
+            self.num_inliers_at_keyframe = int((self.world.landmarks.rows(moved[-1].ids) >= 0).sum())
         return moved
 
     def adjust_whole(self) -> int:

@@ -11,7 +11,11 @@ from semcast.common.geometry import invert_transform, make_transform, rotation_a
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping import rebuilding, reconstruction
 from semcast.server.mapping.contradiction import Contradiction
+
+
+from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.keyframe_images import ImagedMap, KeyframeImages
+from semcast.server.mapping.map_builder import MapBuilder
 from semcast.server.mapping.rebuilding import bring_in, rebuild
 from semcast.server.mapping.settings import ReconstructionSettings
 
@@ -137,3 +141,27 @@ def test_keyframes_that_were_thinned_out_go_with_those_before_them():
         away, turned_deg = errors({frame_id: world.poses[frame_id]})
         assert away < 0.03
         assert turned_deg < 2.5
+
+
+def test_a_growing_map_is_put_right_as_soon_as_it_is_contradicted():
+    whole = make_map(bent_poses())
+    marks, image = whole.landmarks, np.zeros((*CAMERA.shape_hw, 3), np.uint8)
+    settings = ReconstructionSettings(sigma0_px=0.3)
+    builder = MapBuilder(CAMERA, settings, InlineBundle(), on_moved=lambda scale: None)
+    world, builder.num_inliers_at_keyframe = builder.world, 5000
+    world.add_landmarks(marks.ids, marks.xyz, np.zeros((len(marks), 3), np.uint8), marks.confidence, 0, 0)
+    for keyframe in whole.keyframes:
+        world.add_keyframe(keyframe)
+        moved = builder.put_straight(image)
+        if moved:
+            break
+    assert FIRST_BENT + 1 < len(world.keyframes) <= FIRST_BENT + 5
+    assert moved == world.keyframes[-len(moved) :]
+    assert moved[0].frame_id < 2 * FIRST_BENT
+    away, turned_deg = errors(world.poses)
+    assert away < 0.02
+    assert turned_deg < 0.5
+    assert world.drift.of(moved[-1].frame_id) is not None, "it was adjusted"
+    num_seen = int((world.landmarks.rows(moved[-1].ids) >= 0).sum())
+    assert num_seen > int(np.isin(moved[-1].ids, marks.ids).sum()), "tracks are landmarks as well"
+    assert builder.num_inliers_at_keyframe == pytest.approx(num_seen, rel=0.05)
