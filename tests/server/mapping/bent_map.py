@@ -36,13 +36,13 @@ def bent_poses():
     return poses
 
 
-def make_map(poses, *, mover_px=0.0, noise_px=0.2, seed=0):
+def make_map(poses, *, mover_px=0.0, movers_of_3=1, noise_px=0.2, seed=0):
     """Keyframes 0, 2, 4 ... as a map has them; what they saw is the truth.
 
     Args:
         poses: ``T_world_cam`` of the map.
-        mover_px: From keyframe to keyframe, how far a third of the tracks go by themselves; they have no
-            landmark.
+        mover_px: From keyframe to keyframe, how far some tracks go by themselves; they have no landmark.
+        movers_of_3: How many of three tracks do.
         noise_px: Of the tracks.
         seed: Of scene and noise.
 
@@ -51,7 +51,7 @@ def make_map(poses, *, mover_px=0.0, noise_px=0.2, seed=0):
     """
     rng = np.random.default_rng(seed)
     xyz = rng.uniform((-1.5, -0.8, _DEPTH_M - 0.15), (3.0, 0.8, _DEPTH_M + 0.15), (900, 3))
-    moves = np.arange(len(xyz)) % 3 == 0
+    moves = np.arange(len(xyz)) % 3 < movers_of_3
     world = WorldMap()
     for k, (T_map, T_true) in enumerate(zip(poses, true_poses(), strict=True)):
         xy = CAMERA.project(transform_points(invert_transform(T_true), xyz))

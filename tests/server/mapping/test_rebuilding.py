@@ -14,9 +14,10 @@ from semcast.server.mapping.contradiction import Contradiction
 
 
 from semcast.server.mapping.bundle import InlineBundle
+from semcast.server.mapping.contradiction import Contradiction
 from semcast.server.mapping.keyframe_images import ImagedMap, KeyframeImages
 from semcast.server.mapping.map_builder import MapBuilder
-from semcast.server.mapping.rebuilding import bring_in, rebuild
+from semcast.server.mapping.rebuilding import bring_in, put_straight, rebuild
 from semcast.server.mapping.settings import ReconstructionSettings
 
 NOISE = NoiseModel(0.3, 0.0)
@@ -70,13 +71,15 @@ def test_landmarks_move_or_go_and_frames_take_over_the_scale():
     truth = world.landmarks.xyz.copy()
     is_seen_late = truth[:, 0] > 1.6
     world.move_landmarks(world.landmarks.ids[is_seen_late], truth[is_seen_late] + 0.5)
-    old, young = 5001, 5002
+    old, young, elsewhere = 5001, 5002, 5003
     xyz, rgb = np.ones((2, 3)), np.zeros((2, 3), np.uint8)
     world.add_landmarks(np.array([old, young]), xyz, rgb, np.ones(2), 0, np.array([-2, 2 * FIRST_BENT]))
+    world.add_landmarks(np.array([elsewhere]), xyz[:1], rgb[:1], np.ones(1), 1, 2 * FIRST_BENT)
     found = rebuilt(world)
     bring_in(world, found, 0)
     assert old in world.landmarks.ids, "that of an older keyframe stays"
     assert young not in world.landmarks.ids
+    assert elsewhere in world.landmarks.ids, "that of another part stays"
     known = found.ids[np.isin(found.ids, world.landmarks.ids)]
     off = np.linalg.norm(world.landmarks.xyz_of(known) - truth[known // 2], axis=1)
     assert np.percentile(off, 90) < 0.05
@@ -141,6 +144,42 @@ def test_keyframes_that_were_thinned_out_go_with_those_before_them():
         away, turned_deg = errors({frame_id: world.poses[frame_id]})
         assert away < 0.03
         assert turned_deg < 2.5
+
+
+class Says(Contradiction):
+    """Is asked once, and told what came of it."""
+
+    def __init__(self, says):
+        super().__init__(CAMERA, seed=0)
+        self._says_so, self.noted = says, []
+
+    def look(self, world, submap):
+        return self._says_so
+
+    def note(self, *, was_right):
+        self.noted.append(was_right)
+
+
+@pytest.mark.parametrize(
+    ("says", "poses", "noted"),
+    [(False, bent_poses, []), (True, true_poses, [False]), (True, bent_poses, [True])],
+)
+def test_the_adjustment_under_way_is_waited_for_where_the_map_may_be_wrong(says, poses, noted):
+    world, contradiction, settled = make_map(poses()), Says(says), []
+    mapped = ImagedMap(CAMERA, world, KeyframeImages(3), 0)
+
+    def settle():
+        settled.append({k: T.copy() for k, T in world.poses.items()})
+
+    before = {k: T.copy() for k, T in world.poses.items()}
+    moved = put_straight(contradiction, mapped, NOISE, ReconstructionSettings(), settle=settle)
+    assert contradiction.noted == noted
+    assert len(settled) == says
+    for poses_then in settled:
+        np.testing.assert_equal(poses_then, before)
+    assert bool(moved) == (noted == [True])
+    if not moved:
+        np.testing.assert_equal(world.poses, before)
 
 
 def test_a_growing_map_is_put_right_as_soon_as_it_is_contradicted():
