@@ -32,7 +32,10 @@ _SIGMA_PX, _CUT = 0.3, 3.3
 _GOOD = 1.0
 #: How much larger the mean squared error of all tracks must be than at the pose that fits them best.
 _FAR_WORSE = 0.5
-#: The same of the landmarks among them.
+#: What a refinement of that pose gains at most. It takes several times as long as the search, and is left out
+#: where that can't matter.
+_REFINED = 0.1
+#: The same as _FAR_WORSE of the landmarks among the tracks.
 _WORSE = 0.2
 #: Of the newest pairs, how many must say so.
 _NUM_PAIRS, _MIN_PAIRS = 4, 3
@@ -91,25 +94,24 @@ class Contradiction:
         mapped = _squared(mapped_px)
         if mapped.mean() < _GOOD:
             return False
-        best_px = self._best_px(xy0, xy1)
-        if best_px is None:
+        T_best = self._search(xy0, xy1)
+        if T_best is None:
             return False
-        more = mapped - _squared(best_px)
+        more = mapped - _squared(half_line_px(self._camera, T_best, xy0, xy1))
+        if more.mean() > _FAR_WORSE - _REFINED:
+            T_best = refine_relative_pose(self._camera, T_best, xy0, xy1, np.full(len(xy0), _SIGMA_PX))
+            more = mapped - _squared(half_line_px(self._camera, T_best, xy0, xy1))
         return bool(more.mean() > _FAR_WORSE and more[is_landmark].mean() > _WORSE)
 
-    def _best_px(self, xy0: Array, xy1: Array) -> Array | None:
-        """How far tracks ``(N, 2)`` are from their half lines at the relative pose that fits them best."""
+    def _search(self, xy0: Array, xy1: Array) -> Array | None:
+        """Relative pose that fits tracks ``(N, 2)`` best, translation of length 1; None without one."""
         options = {
             "max_epipolar_error": _CUT * _SIGMA_PX,
             "min_iterations": _ITERATIONS // 2,
             "max_iterations": _ITERATIONS,
             "seed": self._seed,
         }
-        found = lo_ransac(self._camera, xy0, xy1, options)
-        if found is None:
-            return None
-        T = refine_relative_pose(self._camera, found, xy0, xy1, np.full(len(xy0), _SIGMA_PX))
-        return half_line_px(self._camera, T, xy0, xy1)
+        return lo_ransac(self._camera, xy0, xy1, options)
 
 
 def _squared(distance_px: Array) -> Array:

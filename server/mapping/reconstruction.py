@@ -233,7 +233,7 @@ class Reconstruction:
             pose = self._improved(sight, pose)
             tracks.refill(sight)
             self._map.make_keyframe(sight, tracks, pose.T_world_cam)
-            self._put_straight(frame)
+            pose = self._put_straight(frame) or pose
             self._scale.look(self._map.world, self._map.noise.model)
             self._frames_since_keyframe = 0
             self._lap("map", since)
@@ -241,16 +241,21 @@ class Reconstruction:
             pose = pose.with_unit(self._map.place_again(self._placement))
         return self._result(frame, self._last_pose(), pose, is_keyframe=is_keyframe)
 
-    def _put_straight(self, frame: DecodedFrame) -> None:
-        """Build the newest keyframes anew where the map has gone wrong, and let the camera have moved so."""
+    def _put_straight(self, frame: DecodedFrame) -> TrackedPose | None:
+        """Build the newest keyframes anew where the map has gone wrong, and let the camera have moved so.
+
+        Returns:
+            Its pose by what it sees of the map as it is now; None where nothing changed or too few agree.
+        """
         moved = self._map.put_straight(frame.image)
-        if moved:
-            logger.info("frame %d: the map went wrong since frame %d", frame.frame_id, moved[0].frame_id)
-            self._motion.reset()
-            for k in moved[-_NUM_MOTION:]:
-                self._motion.observe(
-                    k.frame_id, k.t_source_ns, k.T_world_cam, self._map.world.landmarks.xyz_of(k.ids)
-                )
+        if not moved:
+            return None
+        logger.info("frame %d: the map went wrong since frame %d", frame.frame_id, moved[0].frame_id)
+        self._motion.reset()
+        for k in moved[-_NUM_MOTION:]:
+            xyz = self._map.world.landmarks.xyz_of(k.ids)
+            self._motion.observe(k.frame_id, k.t_source_ns, k.T_world_cam, xyz)
+        return self._locator.pose(moved[-1].T_world_cam)
 
     def _improved(self, sight: Sight, pose: TrackedPose) -> TrackedPose:
         """Take drift out of a keyframe to be: out of its tracks, and where the camera has been before."""

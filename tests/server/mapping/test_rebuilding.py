@@ -10,9 +10,6 @@ from drawn_boards import ate_percent, frame_of, make, render, sideways
 from semcast.common.geometry import invert_transform, make_transform, rotation_angle_deg
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping import rebuilding, reconstruction
-from semcast.server.mapping.contradiction import Contradiction
-
-
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.contradiction import Contradiction
 from semcast.server.mapping.keyframe_images import ImagedMap, KeyframeImages
