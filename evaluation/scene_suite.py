@@ -27,6 +27,7 @@ _SEEDS = {
     "survey": 106,
     "corridor": 107,
     "flat": 108,
+    "office": 109,
 }
 _LINK_DB = 6.0
 #: The longest scene and the nights are measured behind that link alone, all others behind a worse one too.
@@ -42,6 +43,7 @@ SCENE_SECONDS: dict[SceneName, tuple[float, float]] = {
     "block": (44.0, 30.0),
     "survey": (20.0, 14.0),
     "corridor": (20.0, 12.0),
+    "office": (20.0, 12.0),
 }
 #: Scenes that are drawn at night as well: a fifth of the light, twice the noise.
 NIGHTS: tuple[SceneName, ...] = ("room", "street")

@@ -9,6 +9,7 @@ Scenes
     orbit     a still life on a table, from all sides
     survey    fields and farms, from a drone
     corridor  bare corridors, from a small robot
+    office    desks, shelves and bare corners, through a handheld camera
 
 Drawing
     render    a scene as a recorded sequence

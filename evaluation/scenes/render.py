@@ -20,6 +20,7 @@ from semcast.evaluation.scenes.corridor import Corridor
 from semcast.evaluation.scenes.flat import Flat
 from semcast.evaluation.scenes.lorry import Lorry
 from semcast.evaluation.scenes.motion import Pace
+from semcast.evaluation.scenes.office import Office
 from semcast.evaluation.scenes.optics import Optics
 from semcast.evaluation.scenes.orbit import Orbit
 from semcast.evaluation.scenes.room import Room
@@ -52,7 +53,7 @@ class Scene(Protocol):
         """Return ``(H, W, 3)`` grey levels of what is seen where no surface is."""
 
 
-SceneName = Literal["room", "flat", "street", "block", "lorry", "orbit", "survey", "corridor"]
+SceneName = Literal["room", "flat", "street", "block", "lorry", "orbit", "survey", "corridor", "office"]
 SCENES: dict[SceneName, type[Room] | type[Orbit] | type[Street] | type[Survey] | type[Corridor]] = {
     "room": Room,
     "flat": Flat,
@@ -62,6 +63,7 @@ SCENES: dict[SceneName, type[Room] | type[Orbit] | type[Street] | type[Survey] |
     "orbit": Orbit,
     "survey": Survey,
     "corridor": Corridor,
+    "office": Office,
 }
 
 
@@ -121,7 +123,7 @@ class RenderSettings:
             "help": "room: handheld, 30 Hz; flat: a room with bare walls, handheld, 15 Hz; street: from a "
             "car, 10 Hz; block: the same round a block of houses and on; lorry: the street behind a lorry; "
             "orbit: round a still life, 10 Hz; survey: fields from a drone that looks down, 10 Hz; corridor: "
-            "bare walls from a small robot, 15 Hz"
+            "bare walls from a small robot, 15 Hz; office: desks, shelves and bare corners, handheld, 15 Hz"
         },
     )
     pace: Pace = field(default="normal", metadata={"help": "how fast the camera moves and shakes"})

@@ -88,14 +88,19 @@ class Room:
         return np.zeros((self.camera.height, self.camera.width, 3), np.float32)
 
 
-def walls_of(textures: Sequence[Texture], carpet_repeats: tuple[float, float]) -> list[Surface]:
+def walls_of(
+    textures: Sequence[Texture],
+    carpet_repeats: tuple[float, float],
+    size_m: tuple[float, float, float] = Room.size_m,
+) -> list[Surface]:
     """Return four walls, the floor and the ceiling.
 
     Args:
         textures: Of these, in that order.
         carpet_repeats: How often the floor's fits along the room and across.
+        size_m: Length, width and height.
     """
-    length, width, height = np.diag(Room.size_m)
+    length, width, height = np.diag(size_m)
     corner = np.zeros(3)
     return [
         Surface(corner + height, length, -height, textures[0], light=0.95),

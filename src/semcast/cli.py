@@ -51,7 +51,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "shutter": ("shutter", "find how long a camera's rolling shutter takes, from a video or live"),
     "render": (
         "render",
-        "draw a sequence with an exact path: room, street, block, lorry ahead, orbit, survey, corridor",
+        "draw a sequence with an exact path: room, office, street, block, lorry, orbit, survey, corridor",
     ),
     "eval": ("evaluate", "measure trajectories, frame pairs, codecs and confidence offline"),
     "train": ("train", "train a transceiver from a settings file"),

@@ -4,6 +4,7 @@ import copy
 import filecmp
 import functools
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from semcast.common.sequence import open_sequence
 from semcast.evaluation.scenes.motion import Pace
 from semcast.evaluation.scenes.orbit import Orbit
 from semcast.evaluation.scenes.render import SCENES, RenderSettings, Scene, SceneName, frame_of, render_scene
+from semcast.evaluation.scenes.surfaces import exact_depth
 from semcast.evaluation.trajectory import TrajectorySettings, evaluate_trajectory
 
 
@@ -121,6 +123,28 @@ def test_a_drive_round_the_block_ends_where_it_began() -> None:
     assert again < len(poses) - 50, "and goes on"
     assert away_m[again] < 1.0
     assert rotation_angle_deg(poses[again, :3, :3].T @ poses[0, :3, :3]) < 3
+
+
+def test_a_walk_round_the_office_passes_bare_corners_and_shelves() -> None:
+    scene = scene_of("office")
+    small = replace(scene.camera, fx=53.0, fy=53.0, cx=31.5, cy=23.5, width=64, height=48)
+
+    # Neither walls, floor and ceiling nor what is narrow, as sockets and skirting boards are.
+    large = [
+        s for s in scene.surfaces(0.0)[6:] if np.linalg.norm([s.edge_u_m, s.edge_v_m], axis=1).min() > 0.1
+    ]
+    shares = np.array(
+        [
+            np.isfinite(exact_depth(large, small, scene.T_world_cam(t_s))).mean()
+            for t_s in np.arange(0, 30, 0.25)
+        ]
+    )
+    bare_s = [0.25 * len(corner) for corner in "".join(" b"[int(x < 0.04)] for x in shares).split()]
+    assert len(bare_s) >= 3
+    assert 0.5 <= np.median(bare_s) <= 1.5
+    assert np.median(shares) > 0.15
+    assert shares.max() > 0.5, "before a shelf"
+    assert rotation_angle_deg(scene.T_world_cam(30.0)[:3, :3].T @ scene.T_world_cam(0.0)[:3, :3]) < 40
 
 
 def test_seeds_and_paces_differ() -> None:
