@@ -27,7 +27,7 @@ _SEEDS = {
     "survey": 106,
     "corridor": 107,
     "flat": 108,
-    "office": 109,
+    "office": 110,
 }
 _LINK_DB = 6.0
 #: The longest scene and the nights are measured behind that link alone, all others behind a worse one too.
