@@ -245,7 +245,7 @@ class Reconstruction:
         """Build the newest keyframes anew where the map has gone wrong, and let the camera have moved so.
 
         Returns:
-            Its pose by what it sees of the map as it is now; None where nothing changed or too few agree.
+            The frame's pose in the map as it is now; None where nothing changed or too few landmarks agree.
         """
         moved = self._map.put_straight(frame.image)
         if not moved:
