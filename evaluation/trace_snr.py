@@ -9,7 +9,7 @@ from semcast.channel.trace import SNR_RANGE_DB
 
 
 def check_snrs(snr_db: Sequence[float], link: ChannelSettings, by_default: Sequence[float] = ()) -> None:
-    """Check that SNRs are in range, and that no link would be measured twice under two of them.
+    """Check that SNRs are in range, and that no link would be measured twice.
 
     Args:
         snr_db: At which a link is measured.
@@ -17,12 +17,15 @@ def check_snrs(snr_db: Sequence[float], link: ChannelSettings, by_default: Seque
         by_default: What nobody asked for: of these a link that has its own takes none.
 
     Raises:
-        ValueError: There is none, one is out of range, or there are several and a file has its own.
+        ValueError: There is none, one is out of range or there twice, or there are several and a file has its
+            own.
     """
     low, high = SNR_RANGE_DB
     values = " ".join(f"{value:g}" for value in snr_db) or "none"
     if not snr_db or any(not low <= value <= high for value in snr_db):
         raise ValueError(f"snr_db must be one or more values in [{low:g}, {high:g}], got {values}")
+    if len(set(snr_db)) != len(snr_db):
+        raise ValueError(f"snr_db must be different values, got {values}")
     if len(snr_db) > 1 and link.has_own_snr and tuple(snr_db) != tuple(by_default):
         raise ValueError(f"snr_db must be a single value with --trace file, which sets the SNR, got {values}")
 

@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 
-from semcast.common.errors import CheckpointError
+from semcast.common.errors import CheckpointError, ConfigError
 from semcast.common.nets.checkpoint import load_transceiver
 from semcast.common.nets.manifest import weights_path
 from semcast.common.nets.onnx_encoder import FORMAT, INPUTS, OUTPUT, VALUES_INPUT, VARIABLE_FORMAT
 from semcast.common.nets.packing import share_plane
 from semcast.common.nets.rounding import rounded_snr_db
+from semcast.common.nets.vit import VitEncoder
 from semcast.common.phy.slots import LATENT_CHANNELS
 from semcast.common.whole_file import write_whole
 from semcast.training.data import read_images
@@ -55,10 +56,16 @@ def export_encoder(name_or_path: str | Path, out: Path, int8_images: Path | None
 
     Raises:
         CheckpointError: There are no such weights, or the file can't be written.
+        ConfigError: The encoder is a transformer.
         SourceError: The folder holds no images.
     """
     images = [] if int8_images is None else read_images(int8_images)
     model, manifest = load_transceiver(weights_path(name_or_path))
+    if isinstance(model.encoder, VitEncoder):  # a graph would keep the windows of the image it was made with
+        raise ConfigError(
+            f"weights must be of an encoder of convolutions, got {manifest.architecture}, whose windows of "
+            "attention follow the image size: its agent needs torch"
+        )
     example: tuple[Tensor, ...] = (torch.zeros(1, 64, 96, 3, dtype=torch.uint8), torch.full((1,), 10.0))
     if model.is_variable:
         example = (*example, torch.full((1, 1, 4, 6), float(LATENT_CHANNELS)))

@@ -20,6 +20,7 @@ from semcast.common.nets.latent import symbols_from_latent
 from semcast.common.nets.manifest import read_manifest, weights_path
 from semcast.common.nets.onnx_encoder import OnnxEncoder, encoder_path
 from semcast.common.nets.transceiver import Sizes, build_3dcsc
+from semcast.common.nets.vit import VitSizes, build_vit
 from semcast.training.onnx_export import export_encoder
 
 TINY = Sizes((8, 8, 8), (1, 1, 1), (1, 1, 1), 8)
@@ -128,6 +129,16 @@ def test_eight_bits_need_photos(weights, tmp_path):
     cv2.imwrite(str(tmp_path / "tiny.png"), np.zeros((8, 8, 3), np.uint8))
     with pytest.raises(SourceError, match="sides of at least 32 pixels, .*tiny.png is 8x8"):
         export_encoder(weights, tmp_path / "out.onnx", tmp_path)
+    assert not (tmp_path / "out.onnx").exists()
+
+
+def test_a_transformer_is_not_exported_with_the_windows_of_one_size(tmp_path):
+    sizes = VitSizes(dim=16, heads=2, encoder_depth=1, decoder_depth=1, window=2, confidence_channels=8)
+    facts = {"architecture": "vit", "sizes": sizes, "cbr": 1 / 16, "snr_range_db": (0.0, 14.0)}
+    weights = tmp_path / "tiny.safetensors"
+    save_transceiver(build_vit(sizes), weights, made_by={"steps": 0}, **facts)
+    with pytest.raises(ConfigError, match="must be of an encoder of convolutions, got vit, .* needs torch"):
+        export_encoder(weights, tmp_path / "out.onnx")
     assert not (tmp_path / "out.onnx").exists()
 
 

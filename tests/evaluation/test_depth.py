@@ -171,6 +171,7 @@ def test_images_without_movement_are_refused(tmp_path, phase_codec):
         ({"confidence": ("on", "on")}, "confidence must be"),
         ({"seconds": 0.0}, "seconds must be"),
         ({"snr_db": (99.0,)}, "snr_db must be"),
+        ({"snr_db": (2.0, 2.0)}, "snr_db must be different values, got 2 2"),
         ({"max_frames": 0}, "max_frames must be"),
         ({"seed": -1}, "seed must be at least 0, got -1"),
         ({"seeds": 0}, "seeds must be at least 1, got 0"),

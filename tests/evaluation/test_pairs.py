@@ -164,6 +164,7 @@ def test_short_baselines_are_left_out(room):
         ({"min_baseline_m": -0.1}, "min_baseline_m"),
         ({"min_baseline_m": float("nan")}, "min_baseline_m"),
         ({"confidence": ()}, "confidence"),
+        ({"snr_db": (6.0, 10.0, 6.0)}, "snr_db must be different values, got 6 10 6"),
     ],
 )
 def test_settings_out_of_range_are_refused(room, values, message):
