@@ -4,6 +4,7 @@ Matplotlib lives here alone and is used through its object interface, without a 
 is loaded with the first figure: half a second that an evaluation without plots, or ``--help``, need not wait.
 """
 
+import textwrap
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -25,6 +26,8 @@ _COLOURS = (*(f"C{k}" for k in range(10)), "black", "goldenrod")
 
 #: Share of all samples from which a bin stands in a reliability diagram.
 _LEAST_SHARE = 0.001
+#: Letters of a title that a square picture has room for.
+_TITLE_LETTERS = 48
 
 
 def _empty_figure(width_in: float, height_in: float) -> "Figure":
@@ -52,6 +55,16 @@ def new_grid(
     for axes in grid.flat:
         axes.grid(alpha=0.3)
     return figure, [list(row) for row in grid]
+
+
+def _name_below(figure: "Figure", axes: "Axes", most_columns: int) -> None:
+    """Put the names of curves below all axes, in as many columns as the picture is wide enough for."""
+    names = axes.get_legend_handles_labels()
+    for columns in range(most_columns, 0, -1):
+        legend = figure.legend(*names, fontsize="small", loc="outside lower center", ncols=columns)
+        if columns == 1 or legend.get_window_extent().width <= figure.bbox.width:
+            break
+        legend.remove()
 
 
 def save_figure(figure: "Figure", path: Path) -> None:
@@ -155,10 +168,7 @@ def plot_pair_errors(folder: Path, result: Mapping[str, Any]) -> list[Path]:
             axes.set_title(title, fontsize="medium")
         for row in grid:
             row[0].set_ylabel(label, fontsize="small")
-        names = flat[0].get_legend_handles_labels()
-        figure.legend(
-            *names, fontsize="small", loc="outside lower center", ncols=min(len(modes), 3 * num_columns)
-        )
+        _name_below(figure, flat[0], min(len(modes), 3 * num_columns))
         if len(panels) > 1:
             figure.suptitle(str(result.get("title", "")))
         save_figure(figure, folder / name)
@@ -249,7 +259,7 @@ def plot_path(
         axes.plot(positions[:, columns[0]], positions[:, columns[1]], label=name, **style)
     axes.set(xlabel=f"{axes_names[0]} ({unit})", ylabel=f"{axes_names[1]} ({unit})", title=title)
     axes.set_aspect("equal", adjustable="datalim")
-    figure.legend(fontsize="small", loc="outside lower center", ncols=len(trajectories))
+    _name_below(figure, axes, len(trajectories))
     save_figure(figure, path)
 
 
@@ -277,6 +287,7 @@ def plot_reliability(
             markersize=4,
             label=name,
         )
-    axes.set(xlabel="confidence", ylabel=observed, title=title, xlim=(0, 1), ylim=(0, 1))
-    figure.legend(fontsize="small", loc="outside lower center", ncols=4)
+    axes.set(xlabel="confidence", ylabel=observed, xlim=(0, 1), ylim=(0, 1))
+    figure.suptitle(textwrap.fill(title, _TITLE_LETTERS), fontsize="medium")
+    _name_below(figure, axes, 4)
     save_figure(figure, path)

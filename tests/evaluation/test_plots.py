@@ -6,6 +6,7 @@ from matplotlib.text import Text
 
 from semcast.common.errors import SemcastError
 from semcast.evaluation import plots
+from semcast.evaluation.competitors import COMPETITORS
 from semcast.evaluation.picture_strip import write_picture
 from semcast.evaluation.plots import plot_against_snr, plot_pair_errors, plot_path, plot_reliability
 
@@ -89,6 +90,37 @@ def test_long_names_of_curves_leave_the_title_whole(monkeypatch, tmp_path):
     assert figure.bbox.x0 <= box.x0
     assert box.x1 <= figure.bbox.x1
     assert not box.overlaps(legend.get_window_extent())
+
+
+def assert_names_are_whole(figure):
+    figure.draw_without_rendering()
+    (legend,) = figure.legends
+    box = legend.get_window_extent()
+    assert figure.bbox.x0 <= box.x0
+    assert box.x1 <= figure.bbox.x1
+
+
+def test_names_below_the_axes_are_whole_however_many_there_are(monkeypatch, tmp_path):
+    title = "3dcsc-lite-vr.safetensors, parking_synth_60_by_night"
+    table = reliability_of([0.2, 0.8], [0.3, 0.7])
+    for name in ("SNR {} dB", "SNR ramp from {} dB"):
+        tables = {name.format(snr_db): table for snr_db in (2, 6, 10, 14)}
+        (figure,) = drawn_by(
+            monkeypatch, lambda t=tables: plot_reliability(tmp_path / "r.png", t, "what was", title)
+        )
+        assert_names_are_whole(figure)
+        (shown,) = (t for t in figure.findobj(Text) if t.get_text().replace("\n", " ") == title)
+        assert figure.bbox.x0 <= shown.get_window_extent().x0
+    methods = ["robust", "paper", "off", *COMPETITORS, "oracle"]
+    values = {method: {"rot_deg_mean": 1.0, "tdir_deg_mean": 2.0} for method in methods}
+    for num_panels in range(1, 5):
+        cells = [
+            {"snr_db": snr_db, "results": values, "comparisons": [], "features": "klt", "gap": gap}
+            for snr_db in (2.0, 10.0)
+            for gap in range(1, num_panels + 1)
+        ]
+        for figure in drawn_by(monkeypatch, lambda c=cells: plot_pair_errors(tmp_path, {"cells": c})):
+            assert_names_are_whole(figure)
 
 
 def test_path_and_reliability_are_drawn(tmp_path):
