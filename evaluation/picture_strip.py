@@ -12,10 +12,13 @@ from semcast.common.whole_file import write_whole
 
 _CELL_WIDTH_PX = 384
 _LABEL_HEIGHT_PX = 26
+_LABEL_MARGIN_PX = 4
 _GAP_PX = 4
 #: More cells side by side are too small to be judged on a page.
 _MAX_COLUMNS = 4
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
+#: That of a label which fits; of longer ones less.
+_FONT_SIZE = 0.5
 
 
 def _cell(image: NDArray[np.uint8], label: str) -> NDArray[np.uint8]:
@@ -23,7 +26,10 @@ def _cell(image: NDArray[np.uint8], label: str) -> NDArray[np.uint8]:
     scaled = cv2.resize(image, (_CELL_WIDTH_PX, height), interpolation=cv2.INTER_AREA)
     cell = np.full((height + _LABEL_HEIGHT_PX, _CELL_WIDTH_PX, 3), 255, dtype=np.uint8)
     cell[_LABEL_HEIGHT_PX:] = scaled
-    cv2.putText(cell, label, (4, _LABEL_HEIGHT_PX - 8), _FONT, 0.5, (0, 0, 0), 1, cv2.LINE_AA)
+    (width, _), _ = cv2.getTextSize(label, _FONT, _FONT_SIZE, 1)
+    size = _FONT_SIZE * min(1.0, (_CELL_WIDTH_PX - 2 * _LABEL_MARGIN_PX) / max(width, 1))
+    at = (_LABEL_MARGIN_PX, _LABEL_HEIGHT_PX - 8)
+    cv2.putText(cell, label, at, _FONT, size, (0, 0, 0), 1, cv2.LINE_AA)
     return cell
 
 

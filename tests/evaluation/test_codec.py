@@ -316,6 +316,9 @@ def test_a_strip_holds_every_image_once(tmp_path):
     assert long[350, 100].tolist() == [200, 0, 0]
     assert long[350, 500].tolist() == [255, 255, 255]
     assert long[550, 100].tolist() == [0, 0, 200]
+    label = "gpu_run_2/3dcsc-lite-vr-of-october.safetensors: 29.37 dB, SSIM 0.8"
+    one, other = (picture_strip([{label + last: red}])[:26] for last in "38")
+    assert (one != other).any(), "a label ends within its cell"
     write_picture_strip(tmp_path / "new" / "strip.png", [{"a": red}])
     assert (tmp_path / "new" / "strip.png").stat().st_size > 0
     with pytest.raises(ValueError, match="at least one image in each row"):
