@@ -424,7 +424,8 @@ def _train(
                 if on_progress is not None:
                     on_progress(report)
             is_first = False
-            if run.step % settings.valid_every == 0 and run.valid_images and run.rank == 0:
+            is_end = run.share_done() >= 1.0  # which is validated below
+            if run.step % settings.valid_every == 0 and run.valid_images and run.rank == 0 and not is_end:
                 valid = validate(run.shippable(), run.valid_images, run.device, run.bf16)
                 append_row(log, {"step": run.step, "elapsed_s": round(run.elapsed_s, 1), "valid": valid})
             if run.step % settings.save_every == 0:

@@ -119,6 +119,10 @@ def test_hidden_units_are_folded_once_at_the_end(tiny_network, photos, tmp_path,
     monkeypatch.setattr(loop, "folded", lambda *a: folds.append(a) or folded(*a))
     train(settings_for(photos, tmp_path, steps=1, valid=photos))
     assert len(folds) == 1
+    train(settings_for(photos, tmp_path / "run", steps=4, valid=photos, valid_every=2))
+    assert len(folds) == 3, "one half way"
+    rows = [json.loads(line) for line in (tmp_path / "run/log.jsonl").read_text().splitlines()]
+    assert [row["step"] for row in rows if "valid" in row] == [2, 4]
 
 
 def test_a_resumed_run_equals_one_without_a_break(tiny_network, photos, tmp_path):
