@@ -7,8 +7,8 @@ from semcast.evaluation.scenes.street import STEP_M, Street, smoothed
 
 Array = NDArray[np.float64]
 
-#: Laps the road has; a recording is as long as it is asked to be.
-_NUM_LAPS = 3
+#: Laps the road has, as many as the longest recording gets round.
+_NUM_LAPS = 8
 
 
 class Block(Street):

@@ -16,6 +16,8 @@ _BEFORE_M = 20.0
 class Lorry(Street):
     """A street whose far end a lorry hides, and in bends half of what is beside it."""
 
+    _ahead_of_camera_m = _GAP_M + _SIZE_M[0]
+
     def __init__(self, seed: int, pace: Pace) -> None:
         """Build the streets and paint the lorry."""
         super().__init__(seed, pace)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
+from semcast.common.errors import SourceError
 from semcast.common.lens import DistortionModel, check_distortion
 from semcast.common.new_folder import new_folder
 from semcast.common.trajectory import Trajectory, write_tum
@@ -177,7 +178,8 @@ def render_scene(settings: RenderSettings, progress: Callable[[int, int], None] 
         Number of frames.
 
     Raises:
-        SourceError: The folder has files in it or can't be written, or no lens has such a distortion.
+        SourceError: The folder has files in it or can't be written, no lens has such a distortion, or a road
+            ends before the recording does.
     """
     scene_type = SCENES[settings.scene]
     with new_folder(settings.out) as folder:  # this and the lens are refused before the scene is painted
@@ -190,6 +192,11 @@ def render_scene(settings: RenderSettings, progress: Callable[[int, int], None] 
         Optics.of(camera)
         scene = scene_type(settings.seed, settings.pace)
         scene.camera = camera
+        if isinstance(scene, Street) and settings.seconds > scene.lasts_s:
+            raise SourceError(
+                f"seconds must be at most {int(scene.lasts_s)} on this road, which ends then, "
+                f"got {settings.seconds:g}"
+            )
         (folder / "images").mkdir()
         return _draw_into(folder, settings, scene, progress or (lambda _done, _total: None))
 

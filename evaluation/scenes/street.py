@@ -30,6 +30,8 @@ class Street:
     camera = Intrinsics(fx=600.0, fy=600.0, cx=511.5, cy=159.5, width=1024, height=320)
     rate_hz = 10.0
     exposure_s = 0.003
+    #: How much more of the road than the camera needs is always in use.
+    _ahead_of_camera_m = 0.0
 
     def __init__(self, seed: int, pace: Pace) -> None:
         """Build the streets and choose the speed."""
@@ -70,6 +72,12 @@ class Street:
         """Return x, y and heading after a way along the line, in the camera's lane or elsewhere beside it."""
         (x, y), yaw = self._place(way_m)
         return x - left_m * np.sin(yaw), y + left_m * np.cos(yaw), yaw
+
+    @property
+    def lasts_s(self) -> float:
+        """Time at which the camera, or what it is always behind, gets to the end of the road."""
+        way_m = (len(self._line) - 2) * STEP_M - _START_M - self._ahead_of_camera_m
+        return float(np.interp(way_m, np.arange(len(self._time_s)) * STEP_M, self._time_s))
 
     def camera_way_m(self, t_s: float) -> float:
         """Return how far along the line the camera is at a time."""

@@ -14,8 +14,8 @@ from semcast.common.errors import SourceError
 from semcast.common.geometry import rotation_angle_deg
 from semcast.common.sequence import open_sequence
 from semcast.evaluation.scenes.motion import Pace
-from semcast.evaluation.scenes.orbit import Orbit
 from semcast.evaluation.scenes.render import SCENES, RenderSettings, Scene, SceneName, frame_of, render_scene
+from semcast.evaluation.scenes.street import Street
 from semcast.evaluation.scenes.surfaces import exact_depth
 from semcast.evaluation.trajectory import TrajectorySettings, evaluate_trajectory
 
@@ -26,17 +26,22 @@ def scene_of(name: SceneName, seed: int = 0, pace: Pace = "normal") -> Scene:
     return SCENES[name](seed, pace)
 
 
+class Painted:
+    """Stands for the class of a scene that was painted before."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        self.camera, self.rate_hz = scene.camera, scene.rate_hz
+
+    def __call__(self, seed: int, pace: Pace) -> Scene:
+        assert (seed, pace) == (0, "normal")
+        return copy.copy(self._scene)
+
+
 @pytest.fixture
 def painted_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let recordings be drawn of the still life that was painted before, each with a camera of its own."""
-    scene = scene_of("orbit")
-
-    def painted(seed: int, pace: Pace) -> Scene:
-        assert (seed, pace) == (0, "normal")
-        return copy.copy(scene)
-
-    painted.camera, painted.rate_hz = Orbit.camera, Orbit.rate_hz  # type: ignore[attr-defined]
-    monkeypatch.setitem(SCENES, "orbit", painted)
+    monkeypatch.setitem(SCENES, "orbit", Painted(scene_of("orbit")))
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -112,6 +117,26 @@ def test_scenes_fill_the_view_and_cameras_move_smoothly(name: SceneName) -> None
     # No standing still, and no jump: 15 m/s is the fastest any of them goes.
     assert np.median(steps) > 0
     assert steps.max() < 15 / scene.rate_hz
+
+
+@pytest.mark.parametrize("name", ["street", "lorry", "block"])
+def test_a_drive_goes_on_to_the_end_of_the_longest_recording_or_is_refused(
+    name: SceneName, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = scene_of(name)
+    assert isinstance(scene, Street)
+    end_s = min(scene.lasts_s, 120.0)
+    before, at_end = (scene.T_world_cam(end_s - ago_s)[:3, 3] for ago_s in (0.5, 0.0))
+    assert np.linalg.norm(at_end - before) > 1.5, "a car brakes from 10 m/s in more than no time"
+    if name == "lorry":
+        rear_m = [s.corner_m for s in scene.surfaces(end_s)[-6:]]
+        assert np.linalg.norm(np.mean(rear_m, axis=0) - at_end) > 8.0, "and is not driven into"
+    if scene.lasts_s >= 120.0:
+        return
+    monkeypatch.setitem(SCENES, name, Painted(scene))
+    with pytest.raises(SourceError, match=r"seconds must be at most 7\d on this road, .*, got 100"):
+        render_scene(RenderSettings(scene=name, seconds=100.0, out=tmp_path / "x"))
+    assert not (tmp_path / "x").exists()
 
 
 def test_a_drive_round_the_block_ends_where_it_began() -> None:
