@@ -37,7 +37,8 @@ class _Ranges(CalibrationDataReader):  # type: ignore[misc]
         is_variable: bool, images: list[NDArray[np.uint8]], snr_range_db: tuple[float, float]
     ) -> Iterator[dict[str, NDArray[np.generic]]]:
         image_name, snr_name = INPUTS
-        chosen = images[:: max(1, len(images) // _NUM_IMAGES)][:_NUM_IMAGES]
+        count = min(len(images), _NUM_IMAGES)
+        chosen = [images[k * len(images) // count] for k in range(count)]
         for image, snr_db in zip(chosen, np.linspace(*snr_range_db, len(chosen)), strict=True):
             height, width = (min(_SIDE_PX, side) // BLOCK_PX * BLOCK_PX for side in image.shape[:2])
             pixels = np.ascontiguousarray(image[:height, :width])

@@ -54,7 +54,7 @@ class Survey:
         return look(position, heading + shake[0], self._pitch_rad + shake[1], shake[2])
 
     def background(self) -> NDArray[np.float32]:
-        """Return the haze beyond the land, which is out of sight."""
+        """Return the haze beyond the land, of which the first lane shows a strip."""
         return np.full((self.camera.height, self.camera.width, 3), 190.0, np.float32)
 
 

@@ -21,6 +21,7 @@ from semcast.common.nets.manifest import read_manifest, weights_path
 from semcast.common.nets.onnx_encoder import OnnxEncoder, encoder_path
 from semcast.common.nets.transceiver import Sizes, build_3dcsc
 from semcast.common.nets.vit import VitSizes, build_vit
+from semcast.training import onnx_int8
 from semcast.training.onnx_export import export_encoder
 
 TINY = Sizes((8, 8, 8), (1, 1, 1), (1, 1, 1), 8)
@@ -121,6 +122,16 @@ def test_eight_bit_convolutions_hardly_change_the_latent(photos, tmp_path):
     exact, rounded = (encoder.encode(image, 10.0).symbols for encoder in encoders)
     error = np.mean(np.abs(rounded - exact) ** 2)
     assert 0.0 < error < 0.003  # the noise of a link of 10 dB is 0.1
+
+
+def test_ranges_are_learned_from_photos_of_the_whole_folder(tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setattr(onnx_int8, "quantize_static", lambda source, out, ranges, **how: seen.append(ranges))
+    plain = export_encoder("3dcsc-lite", tmp_path / "plain.onnx")
+    onnx_int8.quantise(plain, [], [np.full((32, 32, 3), k, np.uint8) for k in range(95)], (0.0, 14.0))
+    photos = [int(given["image"][0, 0, 0, 0]) for given in iter(seen[0].get_next, None)]
+    assert len(photos) == 48
+    assert max(np.diff([-1, *photos, 95])) <= 2
 
 
 def test_eight_bits_need_photos(weights, tmp_path):
