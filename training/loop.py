@@ -106,9 +106,12 @@ class Run:
         self.step, self.elapsed_s = 0, 0.0
         self.agreed_s = 0.0  # elapsed time all processes agree on, since the schedule depends on it
         self._is_asked_to_stop = self.agreed_stop = False
+        self.snr_range_db = (settings.channel.snr_min_db, settings.channel.snr_max_db)
         checkpoint = self._read_checkpoint()
         if checkpoint is None and settings.grow_from is not None:
-            small, _ = load_transceiver(settings.grow_from)
+            small, manifest = load_transceiver(settings.grow_from)
+            if settings.only_heads:  # in others the encoder would be told other SNRs
+                self.snr_range_db = manifest.snr_range_db
             small = small if settings.only_heads else unfolded(small, self._pass_images)
             if model.is_variable and not small.is_variable:
                 seen = Observations()
@@ -186,6 +189,8 @@ class Run:
             for group, values in zip(optimiser.param_groups, groups, strict=True):
                 group.update(values)
         self.step, self.elapsed_s = state["step"], state["elapsed_s"]
+        if self.settings.only_heads:
+            self.snr_range_db = state.get("snr_range_db", self.snr_range_db)  # not in those of older code
         self.agreed_s = self.elapsed_s
 
     def save(self) -> None:
@@ -201,6 +206,7 @@ class Run:
             "optimisers": [o.state_dict() for o in self.optimisers],
             "step": self.step,
             "elapsed_s": self.elapsed_s,
+            "snr_range_db": self.snr_range_db,
         }
         packed = io.BytesIO()  # torch gives an error of its own where a disk is full
         torch.save(state, packed)
@@ -261,7 +267,7 @@ class Run:
             architecture=settings.architecture,
             sizes=architecture(settings.architecture).sizes,
             cbr=channel_bandwidth_ratio((BLOCK_PX, BLOCK_PX)),
-            snr_range_db=(settings.channel.snr_min_db, settings.channel.snr_max_db),
+            snr_range_db=self.snr_range_db,
             made_by={
                 "settings": plain,
                 "images": len(self.images),

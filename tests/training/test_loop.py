@@ -326,11 +326,14 @@ def test_heads_alone_leave_every_image_as_it_is(tiny_network, photos, tmp_path):
     first = train(settings_for(photos, tmp_path / "whole", head_every=1, loss=LossSettings(confidence=1.0)))
     whole = load_transceiver(first.weights)[0].state_dict()
     heads = settings_for(photos, tmp_path / "heads", only_heads=True, grow_from=first.weights, steps=4)
+    heads = replace(heads, channel=LinkDrawSettings(snr_min_db=4.0, snr_max_db=8.0))
     after = load_transceiver(train(heads).weights)[0].state_dict()
     changed = {name for name in whole if not torch.equal(whole[name], after[name])}
     assert changed == {name for name in whole if name.startswith("confidence.")}
     again = train(replace(heads, steps=8))
     assert again.steps == 8, "it goes on from its checkpoint"
+    ranges_db = [read_manifest(done.weights).snr_range_db for done in (first, again)]
+    assert ranges_db[0] == ranges_db[1], "to which SNRs for the encoder are clipped"
     resumed = load_transceiver(again.weights)[0].state_dict()
     assert torch.equal(whole["decoder.head.weight"], resumed["decoder.head.weight"])
 
