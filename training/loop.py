@@ -45,6 +45,8 @@ logger = logging.getLogger(__name__)
 _VALID_IMAGES = 16
 #: Raised when the same weights mean another network.
 CHECKPOINT_FORMAT = 3
+#: What torch raises on files that are no checkpoints: it takes some for pickles and does as they say.
+_DAMAGED = (RuntimeError, ValueError, EOFError, LookupError, TypeError, pickle.UnpicklingError)
 #: Batches the means of hidden units are taken from, crops in each, and a step no run gets to.
 _FOLD_BATCHES, _FOLD_CROPS, _FOLD_STEP = 24, 16, 2**40
 
@@ -149,8 +151,10 @@ class Run:
         if not self.settings.resume or not self.checkpoint_path.is_file():
             return None
         try:
-            state: dict[str, Any] = torch.load(self.checkpoint_path, map_location="cpu", weights_only=True)
-        except (OSError, RuntimeError, ValueError, EOFError, pickle.UnpicklingError) as err:
+            state = torch.load(self.checkpoint_path, map_location="cpu", weights_only=True)
+            if not isinstance(state, dict):
+                raise TypeError
+        except (OSError, *_DAMAGED) as err:
             raise CheckpointError(
                 f"checkpoint {self.checkpoint_path} can't be read: {type(err).__name__}"
             ) from err

@@ -1,4 +1,5 @@
 import contextlib
+import io
 import json
 import math
 import os
@@ -261,8 +262,15 @@ def test_a_checkpoint_of_other_optimisers_is_refused(change, tiny_network, photo
         train(replace(settings, steps=2, **other))
 
 
-def test_a_damaged_checkpoint_is_refused(tiny_network, photos, tmp_path):
-    (tmp_path / "last.pt").write_bytes(b"nothing")
+def as_checkpoint(value):
+    packed = io.BytesIO()
+    torch.save(value, packed)
+    return packed.getvalue()
+
+
+@pytest.mark.parametrize("left", [b"nothing", b"hello", b"", bytes(1000), as_checkpoint([1])])
+def test_a_damaged_checkpoint_is_refused(left, tiny_network, photos, tmp_path):
+    (tmp_path / "last.pt").write_bytes(left)
     with pytest.raises(CheckpointError, match="can't be read"):
         train(settings_for(photos, tmp_path))
 
