@@ -10,6 +10,7 @@ The frame
     settings          all settings
     sight             one image with the rows that arrived, and the tracks seen in it
     blank             images that show nothing
+    outage            frames of which a link in an outage let little through
     rolling_shutter   images and tracks as if all rows had been exposed at once
     camera_motion     motion prior; images that stay while the camera goes on
 

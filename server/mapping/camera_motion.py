@@ -6,6 +6,7 @@ tell such an image from a camera that stopped at once. The next one that differs
 sets off from where it stood, one that went on is where it would have got to by then.
 """
 
+import logging
 from collections.abc import Sequence
 from itertools import pairwise
 
@@ -17,6 +18,7 @@ from semcast.common.geometry import invert_transform, transform_points
 from semcast.server.geometry.bunches import Bunches, in_bunches
 from semcast.server.geometry.motion import MAX_EXTRAPOLATION_S, ConstantVelocity
 from semcast.server.geometry.whereabouts import Whereabouts
+from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 Array = NDArray[np.float64]
 
@@ -47,7 +49,22 @@ _REST_SHARE = 0.03
 _GAP_INTERVALS = 3.0
 #: Where they come in bunches, and each after a long interval, it is so many of the longest of so many.
 _NUM_INTERVALS = 24
+#: Keyframes that tell the motion of a camera whose path was put right.
+_NUM_MOTION = 4
 _S_PER_NS = 1e-9
+
+logger = logging.getLogger(__name__)
+
+
+def tell_of_old_images(frame_ids: Sequence[int]) -> bool:
+    """Warn of the first of some frames that show an older image; whether there was any."""
+    if frame_ids:
+        logger.warning(
+            "frame %d shows what an earlier one showed, though the camera went on (a video that repeats "
+            "frames, or a camera that hangs): such frames get no pose in the results; told once",
+            frame_ids[0],
+        )
+    return len(frame_ids) > 0
 
 
 class CameraMotion:
@@ -74,6 +91,12 @@ class CameraMotion:
         self._has_gap = False
         self._recent: list[tuple[int, Array]] = []
         self._rests = False
+
+    def begin_with(self, keyframes: Sequence[Keyframe], world: WorldMap) -> None:
+        """Forget the motion for that of the newest keyframes of a path that was put right."""
+        self.reset()
+        for k in keyframes[-_NUM_MOTION:]:
+            self.observe(k.frame_id, k.t_source_ns, k.T_world_cam, world.landmarks.xyz_of(k.ids))
 
     @property
     def rests(self) -> bool:

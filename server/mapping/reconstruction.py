@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.server.mapping.blank import result_of_nothing, shows_nothing
 from semcast.server.mapping.bundle_problem import BundleRunner
-from semcast.server.mapping.camera_motion import CameraMotion
+from semcast.server.mapping.camera_motion import CameraMotion, tell_of_old_images
 from semcast.server.mapping.initialiser import Initialiser
 from semcast.server.mapping.kept_frames import backfill, observed_of
 from semcast.server.mapping.locator import RECOGNISED_CONFIDENCE, Locator
@@ -19,6 +19,7 @@ from semcast.server.mapping.look_back import look_back
 from semcast.server.mapping.map_arrays import RunState
 from semcast.server.mapping.map_builder import MapBuilder
 from semcast.server.mapping.map_update import update_of
+from semcast.server.mapping.outage import Outage
 from semcast.server.mapping.readout import Readout
 from semcast.server.mapping.rolling_shutter import ImageFlow, RollingShutter
 from semcast.server.mapping.scale_watch import ScaleWatch
@@ -29,7 +30,7 @@ from semcast.server.mapping.state import DecodedFrame, FrameResult, MapUpdate, T
 from semcast.server.mapping.submap_placement import SubmapPlacement
 from semcast.server.mapping.tracker import TrackedPose
 from semcast.server.mapping.tracks import TrackTable
-from semcast.server.mapping.world_map import WorldMap
+from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 logger = logging.getLogger(__name__)
 
@@ -40,8 +41,6 @@ Ids = NDArray[np.int64]
 _MIN_USABLE_SHARE = 0.5
 #: Keyframes between two attempts to recognise an older submap.
 _JOIN_INTERVAL = 3
-#: Keyframes that tell the motion of a camera whose path was put right.
-_NUM_MOTION = 4
 #: Share of the landmarks in sight that must agree with a pose found without a prior.
 _MIN_SHARE_WHEN_LOST = 0.5
 
@@ -78,6 +77,7 @@ class Reconstruction:
         self._placement = SubmapPlacement(self._camera, self._map.enough)
         self._scale = ScaleWatch(self._camera)
         self._shutter = RollingShutter(camera, lambda: self._map.watch.is_on)
+        self._outage = Outage()
         self._state = TrackingState.INITIALIZING
         self._last_frame_id = -1
         self._last_posed_id: int | None = None
@@ -137,10 +137,13 @@ class Reconstruction:
             # As a frame that never came: tracks outlive a covered lens as they outlive a gap.
             return result_of_nothing(frame, self._state, self._map_epoch, self._map.submap)
         self.collect()
+        is_tracked = self._state is TrackingState.TRACKING
+        if self._outage.takes(frame):
+            located = self._locate_only(frame) if is_tracked else None
+            return located or result_of_nothing(frame, self._state, self._map_epoch, self._map.submap)
         since = time.perf_counter_ns()
         sight = self._shutter.see(frame)
         T_world_guess = self._motion.predict(frame.t_source_ns)
-        is_tracked = self._state is TrackingState.TRACKING
         self._locator.follow(sight, T_world_guess if is_tracked else None)
         sight, is_first = self._shutter.settle(frame, sight, self._tracks)
         if is_first:
@@ -180,23 +183,10 @@ class Reconstruction:
     def _take_back(self, frame_ids: list[int]) -> None:
         """Leave frames whose image was an older one without a pose, and tell of the first of them."""
         self._map.world.forget_frames(frame_ids)
-        if frame_ids and not self._has_told_old_images:
-            self._has_told_old_images = True
-            logger.warning(
-                "frame %d shows what an earlier one showed, though the camera went on (a video that repeats "
-                "frames, or a camera that hangs): such frames get no pose in the results; told once",
-                frame_ids[0],
-            )
+        self._has_told_old_images = self._has_told_old_images or tell_of_old_images(frame_ids)
 
     def _last_pose(self) -> Array | None:
         return None if self._last_posed_id is None else self._map.world.pose_of_frame(self._last_posed_id)
-
-    def _last_submap(self) -> int | None:
-        """Submap of the last frame with a pose, None without any."""
-        world, frame_id = self._map.world, self._last_posed_id
-        if frame_id is None or frame_id not in world.frames:
-            return None
-        return world.submap_of[world.frames[frame_id][0]]
 
     def _track(self, sight: Sight, T_world_guess: Array | None) -> FrameResult:
         since = time.perf_counter_ns()
@@ -212,12 +202,9 @@ class Reconstruction:
     def _accept(self, sight: Sight, pose: TrackedPose) -> FrameResult:
         """Take a pose: note it, weed out tracks that slipped, and make a keyframe where one is due."""
         frame, tracks = sight.frame, self._tracks
-        reference = self._map.reference_keyframe()
-        assert reference is not None
         self._state, self._lost_ns = TrackingState.TRACKING, []
         self._frames_since_keyframe += 1
-        self._last_posed_id = frame.frame_id
-        self._map.world.add_frame(frame.frame_id, reference.frame_id, pose.T_world_cam)
+        reference = self._note_pose(frame, pose)
         tracks.keep(~np.isin(tracks.ids, pose.ids[~pose.inliers], assume_unique=True))
         tracks.vouch(pose.ids[pose.inliers])
         is_keyframe = self._map.wants_keyframe(
@@ -242,19 +229,12 @@ class Reconstruction:
         return self._result(frame, self._last_pose(), pose, is_keyframe=is_keyframe)
 
     def _put_straight(self, frame: DecodedFrame) -> TrackedPose | None:
-        """Build the newest keyframes anew where the map has gone wrong, and let the camera have moved so.
-
-        Returns:
-            The frame's pose in the map as it is now; None where nothing changed or too few landmarks agree.
-        """
+        """Build the newest keyframes anew where the map went wrong; the frame's pose then, if it is sure."""
         moved = self._map.put_straight(frame.image)
         if not moved:
             return None
         logger.info("frame %d: the map went wrong since frame %d", frame.frame_id, moved[0].frame_id)
-        self._motion.reset()
-        for k in moved[-_NUM_MOTION:]:
-            xyz = self._map.world.landmarks.xyz_of(k.ids)
-            self._motion.observe(k.frame_id, k.t_source_ns, k.T_world_cam, xyz)
+        self._motion.begin_with(moved, self._map.world)
         return self._locator.pose(moved[-1].T_world_cam)
 
     def _improved(self, sight: Sight, pose: TrackedPose) -> TrackedPose:
@@ -269,12 +249,37 @@ class Reconstruction:
 
     def _posed_anew(self, sight: Sight, T_world_guess: Array) -> TrackedPose | None:
         """Estimate the pose of a frame again whose tracks or landmarks have moved."""
-        anew, reference = self._locator.pose(T_world_guess), self._map.reference_keyframe()
-        if anew is None or reference is None:
-            return None
-        self._map.world.add_frame(sight.frame.frame_id, reference.frame_id, anew.T_world_cam)
-        self._moved(1.0)
+        anew = self._locator.pose(T_world_guess)
+        if anew is not None:
+            self._note_pose(sight.frame, anew)
+            self._moved(1.0)
         return anew
+
+    def _locate_only(self, frame: DecodedFrame) -> FrameResult | None:
+        """Pose of a frame by tracks that stay as the frames before left them; None where it is not sure."""
+        since = time.perf_counter_ns()
+        sight, T_world_guess = self._shutter.see(frame), self._motion.predict(frame.t_source_ns)
+        with self._tracks.aside():
+            self._locator.follow(sight, T_world_guess)
+            pose = self._locator.track(sight, T_world_guess)
+            self._lap("track", since)
+            if pose is None:
+                return None
+            self._note_pose(frame, pose)
+            result = self._result(frame, pose.T_world_cam, pose)
+            if self._on_pose is not None:
+                self._on_pose(result)
+        self._moves_to(frame.frame_id, frame.t_source_ns, pose.T_world_cam, pose.ids[pose.inliers])
+        self._placement.note(sight, pose.T_world_cam, self._motion, self._map.world)
+        return result
+
+    def _note_pose(self, frame: DecodedFrame, pose: TrackedPose) -> Keyframe:
+        """Keep a pose; the keyframe it is kept relative to."""
+        reference = self._map.reference_keyframe()
+        assert reference is not None
+        self._last_posed_id = frame.frame_id
+        self._map.world.add_frame(frame.frame_id, reference.frame_id, pose.T_world_cam)
+        return reference
 
     def _find(self, sight: Sight) -> FrameResult:
         """A frame without a running track: recognise a place, or work towards a new map."""
@@ -340,7 +345,7 @@ class Reconstruction:
             return None
         # Nothing is given up for a place before there is a pose in it.
         if (pose := self._locator.pose_at(place)) is not None:
-            last = self._last_submap()
+            last = self._map.world.submap_of_frame(self._last_posed_id)
             if last is not None and place.submap < last == self._map.world.keyframes[-1].submap:
                 self._settle(last, sight, pose.T_world_cam, place.submap)
             if whereabouts is None or place.submap != last:

@@ -1,6 +1,8 @@
 """Keypoint tracks: points followed from image to image, with the confidence of their newest position."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -152,6 +154,17 @@ class TrackTable:
         """Forget tracks outside the mask."""
         for name in _COLUMNS:
             setattr(self, name, getattr(self, name)[mask])
+
+    @contextmanager
+    def aside(self) -> Iterator[None]:
+        """Let tracks be followed and changed for the time being, and be afterwards as they were."""
+        # Arrays and images are replaced and never written to, lists of them are.
+        before = {name: copy(v) if isinstance(v, list) else v for name, v in vars(self).items()}
+        before["passing"] = copy(self.passing)
+        try:
+            yield
+        finally:
+            vars(self).update(before)
 
     def renew(self, others: Ids) -> tuple[Ids, Ids]:
         """Give all tracks new ids, as if they began now, and ids kept elsewhere with them.

@@ -308,6 +308,12 @@ class WorldMap:
         self.drift.keep({k.frame_id for k in self.keyframes})
         return True
 
+    def submap_of_frame(self, frame_id: int | None) -> int | None:
+        """Part of the map a frame is in, None without a pose."""
+        if frame_id is None or frame_id not in self.frames:
+            return None
+        return self.submap_of[self.frames[frame_id][0]]
+
     def pose_of_frame(self, frame_id: int) -> Array | None:
         """Best current ``T_world_cam`` of a frame, None where it has none."""
         if frame_id not in self.frames:

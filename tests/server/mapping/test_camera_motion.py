@@ -234,7 +234,7 @@ def test_a_road_is_driven_past_a_grabber_that_hangs(num_hung, parts, caplog):
     reconstruction.close()
     assert len(submaps) == parts
     assert sorted(set(range(num)) - set(poses)) == list(hung)
-    told = [r.getMessage() for r in caplog.records if r.name.endswith("reconstruction")]
+    told = [r.getMessage() for r in caplog.records if r.name.endswith("camera_motion")]
     assert [text[:9] for text in told if "shows what an earlier one showed" in text] == ["frame 16 "]
     error = ate(trajectory_of(poses, times_ns), sequence.groundtruth())
     assert error.rmse < 0.2
