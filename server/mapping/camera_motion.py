@@ -56,17 +56,6 @@ _S_PER_NS = 1e-9
 logger = logging.getLogger(__name__)
 
 
-def tell_of_old_images(frame_ids: Sequence[int]) -> bool:
-    """Warn of the first of some frames that show an older image; whether there was any."""
-    if frame_ids:
-        logger.warning(
-            "frame %d shows what an earlier one showed, though the camera went on (a video that repeats "
-            "frames, or a camera that hangs): such frames get no pose in the results; told once",
-            frame_ids[0],
-        )
-    return len(frame_ids) > 0
-
-
 class CameraMotion:
     """Predicts poses from those before, and finds those whose image was not of their time.
 
@@ -78,6 +67,7 @@ class CameraMotion:
         self._camera = camera
         #: Of the last frames that came: number and time.
         self._came: list[tuple[int, int]] = []
+        self._has_told_old_images = False
         self.reset()
 
     def reset(self) -> None:
@@ -240,7 +230,7 @@ class CameraMotion:
             elif len(self._still) > _SHORT_STAY:
                 self._motion.observe(self._still_ns, T_world_moving)
         self._go_on(frame_id, t_source_ns, T_world_cam)
-        return withdrawn
+        return self._told_of(withdrawn)
 
     def give_up(self) -> list[int]:
         """Let a camera that seemed to stop have gone on: what it saw is out of sight.
@@ -249,7 +239,18 @@ class CameraMotion:
             Frames whose image was an older one, as ``observe`` does.
         """
         withdrawn, self._still = self._still, []
-        return withdrawn
+        return self._told_of(withdrawn)
+
+    def _told_of(self, frame_ids: list[int]) -> list[int]:
+        """Return frames that show an older image, the first of which is told."""
+        if frame_ids and not self._has_told_old_images:
+            self._has_told_old_images = True
+            logger.warning(
+                "frame %d shows what an earlier one showed, though the camera went on (a video that repeats "
+                "frames, or a camera that hangs): such frames get no pose in the results; told once",
+                frame_ids[0],
+            )
+        return frame_ids
 
     def _note_rest(self, t_source_ns: int, T_world_cam: Array, xyz: Array) -> None:
         """Compare with the pose of a while ago; none is remembered that is older than need be."""

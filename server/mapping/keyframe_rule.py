@@ -61,11 +61,14 @@ class KeyframeCues:
     usable_share: float
 
 
-def wants_keyframe(cues: KeyframeCues) -> bool:
+def wants_keyframe(cues: KeyframeCues, *, is_in_outage: bool = False) -> bool:
     """Decide on a keyframe: the view has changed, or landmarks are running out.
 
-    A frame of which much is missing becomes one only in need.
+    A frame of which much is missing becomes one only in need. In an outage landmarks run out because the
+    image is bad, and new ones would be no better: there the view must be another one, and the pose be sure.
     """
+    if is_in_outage and (cues.num_inliers < _FEW or cues.median_flow_px <= _MOVED_WIDTHS * cues.width_px):
+        return False
     few = cues.num_inliers < max(_FEW_SHARE * cues.num_inliers_at_keyframe, _FEW)
     if cues.usable_share < _DAMAGED_SHARE:
         return few and cues.frames_since >= _DAMAGED_APART

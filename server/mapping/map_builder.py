@@ -20,7 +20,7 @@ from semcast.server.mapping.guessed_place import GuessedPlace
 from semcast.server.mapping.joining import may_join
 from semcast.server.mapping.kept_frames import Observed, colours_of
 from semcast.server.mapping.keyframe_images import ImagedMap, KeyframeImages, SeenFrom
-from semcast.server.mapping.keyframe_rule import KeyframeCues, median_flow_px, wants_keyframe
+from semcast.server.mapping.keyframe_rule import KeyframeCues, median_flow_px
 from semcast.server.mapping.late_readout import put_map_right
 from semcast.server.mapping.loop_closure import Loop, LoopFinder, LoopView, share_out
 from semcast.server.mapping.new_landmarks import add_landmarks
@@ -295,20 +295,21 @@ class MapBuilder:
         self.loops.note_tie(found.keyframe_id)
         return len(ids)
 
-    def wants_keyframe(
-        self, reference: Keyframe, tracks: TrackTable, sight: Sight, num_inliers: int, frames_since: int
-    ) -> bool:
-        """Tell whether a frame should become a keyframe.
+    def keyframe_cues(
+        self, tracks: TrackTable, sight: Sight, num_inliers: int, frames_since: int
+    ) -> KeyframeCues:
+        """Return what tells whether a frame should become a keyframe.
 
         Args:
-            reference: The newest keyframe.
             tracks: Of the frame.
             sight: Its image.
             num_inliers: Landmarks its pose rests on.
             frames_since: Frames since the newest keyframe.
         """
         ids, xy = tracks.ids[tracks.visible], tracks.xy[tracks.visible]
-        cues = KeyframeCues(
+        reference = self.reference_keyframe()
+        assert reference is not None
+        return KeyframeCues(
             num_inliers=num_inliers,
             num_inliers_at_keyframe=self.num_inliers_at_keyframe,
             num_visible=len(ids),
@@ -318,7 +319,6 @@ class MapBuilder:
             frames_since=frames_since,
             usable_share=float(sight.usable.mean()),
         )
-        return wants_keyframe(cues)
 
     def make_keyframe(self, sight: Sight, tracks: TrackTable, T_world_cam: Array) -> None:
         """Turn the newest frame into a keyframe, triangulate, and ask for an adjustment."""

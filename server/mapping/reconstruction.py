@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.server.mapping.blank import result_of_nothing, shows_nothing
 from semcast.server.mapping.bundle_problem import BundleRunner
-from semcast.server.mapping.camera_motion import CameraMotion, tell_of_old_images
+from semcast.server.mapping.camera_motion import CameraMotion
 from semcast.server.mapping.initialiser import Initialiser
 from semcast.server.mapping.kept_frames import backfill, observed_of
+from semcast.server.mapping.keyframe_rule import wants_keyframe
 from semcast.server.mapping.locator import RECOGNISED_CONFIDENCE, Locator
 from semcast.server.mapping.look_back import look_back
 from semcast.server.mapping.map_arrays import RunState
@@ -30,7 +31,7 @@ from semcast.server.mapping.state import DecodedFrame, FrameResult, MapUpdate, T
 from semcast.server.mapping.submap_placement import SubmapPlacement
 from semcast.server.mapping.tracker import TrackedPose
 from semcast.server.mapping.tracks import TrackTable
-from semcast.server.mapping.world_map import Keyframe, WorldMap
+from semcast.server.mapping.world_map import WorldMap
 
 logger = logging.getLogger(__name__)
 
@@ -63,7 +64,6 @@ class Reconstruction:
         self._camera = camera
         self._settings = settings
         self._bundle = bundle
-        self._has_told_old_images = False
         self._map = MapBuilder(camera, settings, bundle, self._moved)
         self._map_epoch = 0
         self._begin(settings.with_readout(camera))
@@ -178,12 +178,8 @@ class Reconstruction:
         """Let the motion go on; frames that now turn out to have shown an older image have no pose."""
         xyz, stands = self._map.world.landmarks.xyz_of(ids), self._tracks.passing.camera_stands
         self._map.watch.note(frame_id, t_source_ns)
-        self._take_back(self._motion.observe(frame_id, t_source_ns, T_world_cam, xyz, stands=stands))
-
-    def _take_back(self, frame_ids: list[int]) -> None:
-        """Leave frames whose image was an older one without a pose, and tell of the first of them."""
-        self._map.world.forget_frames(frame_ids)
-        self._has_told_old_images = self._has_told_old_images or tell_of_old_images(frame_ids)
+        older = self._motion.observe(frame_id, t_source_ns, T_world_cam, xyz, stands=stands)
+        self._map.world.forget_frames(older)
 
     def _last_pose(self) -> Array | None:
         return None if self._last_posed_id is None else self._map.world.pose_of_frame(self._last_posed_id)
@@ -203,13 +199,11 @@ class Reconstruction:
         """Take a pose: note it, weed out tracks that slipped, and make a keyframe where one is due."""
         frame, tracks = sight.frame, self._tracks
         self._state, self._lost_ns = TrackingState.TRACKING, []
-        self._frames_since_keyframe += 1
-        reference = self._note_pose(frame, pose)
+        self._note_pose(frame, pose)
         tracks.keep(~np.isin(tracks.ids, pose.ids[~pose.inliers], assume_unique=True))
         tracks.vouch(pose.ids[pose.inliers])
-        is_keyframe = self._map.wants_keyframe(
-            reference, tracks, sight, pose.num_inliers, self._frames_since_keyframe
-        )
+        cues = self._map.keyframe_cues(tracks, sight, pose.num_inliers, self._frames_since_keyframe)
+        is_keyframe = wants_keyframe(cues)
         if self._on_pose is not None:
             self._on_pose(self._result(frame, pose.T_world_cam, pose, is_keyframe=is_keyframe))
         # The pose is on its way now, and nobody waits.
@@ -256,30 +250,38 @@ class Reconstruction:
         return anew
 
     def _locate_only(self, frame: DecodedFrame) -> FrameResult | None:
-        """Pose of a frame by tracks that stay as the frames before left them; None where it is not sure."""
+        """Pose of a frame by tracks that stay as the frames before left them; None where it is not sure.
+
+        Only a camera that sees something else by now goes on from such a frame: what it knows would be gone.
+        """
         since = time.perf_counter_ns()
         sight, T_world_guess = self._shutter.see(frame), self._motion.predict(frame.t_source_ns)
-        with self._tracks.aside():
-            self._locator.follow(sight, T_world_guess)
-            pose = self._locator.track(sight, T_world_guess)
-            self._lap("track", since)
-            if pose is None:
-                return None
-            self._note_pose(frame, pose)
+        before = self._tracks.as_they_are()
+        self._locator.follow(sight, T_world_guess)
+        pose = self._locator.track(sight, T_world_guess)
+        self._lap("track", since)
+        if pose is None:
+            self._tracks.put_back(before)
+            return None
+        self._note_pose(frame, pose)
+        cues = self._map.keyframe_cues(self._tracks, sight, pose.num_inliers, self._frames_since_keyframe)
+        if wants_keyframe(cues, is_in_outage=True):
+            result = self._accept(sight, pose)
+        else:
             result = self._result(frame, pose.T_world_cam, pose)
             if self._on_pose is not None:
                 self._on_pose(result)
-        self._moves_to(frame.frame_id, frame.t_source_ns, pose.T_world_cam, pose.ids[pose.inliers])
+            self._moves_to(frame.frame_id, frame.t_source_ns, pose.T_world_cam, pose.ids[pose.inliers])
+            self._tracks.put_back(before)
         self._placement.note(sight, pose.T_world_cam, self._motion, self._map.world)
         return result
 
-    def _note_pose(self, frame: DecodedFrame, pose: TrackedPose) -> Keyframe:
-        """Keep a pose; the keyframe it is kept relative to."""
+    def _note_pose(self, frame: DecodedFrame, pose: TrackedPose) -> None:
         reference = self._map.reference_keyframe()
         assert reference is not None
+        self._frames_since_keyframe += frame.frame_id != self._last_posed_id
         self._last_posed_id = frame.frame_id
         self._map.world.add_frame(frame.frame_id, reference.frame_id, pose.T_world_cam)
-        return reference
 
     def _find(self, sight: Sight) -> FrameResult:
         """A frame without a running track: recognise a place, or work towards a new map."""
@@ -297,7 +299,7 @@ class Reconstruction:
         if self._settings.gives_up(self._lost_ns, rested=self._motion.rests):
             logger.info("frame %d: a new map is begun, the old one is not in sight", frame.frame_id)
             self._state = TrackingState.INITIALIZING
-            self._take_back(self._motion.give_up())
+            self._map.world.forget_frames(self._motion.give_up())
             self._begin_submap()
 
     def _look_for_start(self, sight: Sight) -> Start | None:
@@ -384,8 +386,7 @@ class Reconstruction:
         self._lap("two_view", since)
         newest, seen = self._map.world.pose_of_frame(sight.frame.frame_id), self._tracks.seen()
         pose = self._locator.pose(newest, seen[self._map.world.landmarks.rows(seen.ids) >= 0])
-        self._state = TrackingState.LOST if pose is None else TrackingState.TRACKING
-        self._lost_ns = []
+        self._state, self._lost_ns = TrackingState.LOST if pose is None else TrackingState.TRACKING, []
         self._last_posed_id = sight.frame.frame_id
         if pose is not None:
             self._moves_to(sight.frame.frame_id, sight.frame.t_source_ns, pose.T_world_cam, grown.ids)
@@ -454,8 +455,7 @@ class Reconstruction:
 
     def whole_map(self) -> MapUpdate:
         """The map as one update, whatever was taken before."""
-        world = self._map.world
-        return update_of(world, world.everything(), self._map_epoch)
+        return update_of(self._map.world, self._map.world.everything(), self._map_epoch)
 
     def conclude(self) -> int:
         """Adjust the whole map of a stream that has ended, if settings want it; the number of keyframes."""

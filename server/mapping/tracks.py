@@ -1,7 +1,6 @@
 """Keypoint tracks: points followed from image to image, with the confidence of their newest position."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from copy import copy
 from dataclasses import replace
 
@@ -155,16 +154,15 @@ class TrackTable:
         for name in _COLUMNS:
             setattr(self, name, getattr(self, name)[mask])
 
-    @contextmanager
-    def aside(self) -> Iterator[None]:
-        """Let tracks be followed and changed for the time being, and be afterwards as they were."""
+    def as_they_are(self) -> dict[str, object]:
+        """All there is, for ``put_back``."""
         # Arrays and images are replaced and never written to, lists of them are.
-        before = {name: copy(v) if isinstance(v, list) else v for name, v in vars(self).items()}
-        before["passing"] = copy(self.passing)
-        try:
-            yield
-        finally:
-            vars(self).update(before)
+        kept = {name: copy(v) if isinstance(v, list) else v for name, v in vars(self).items()}
+        return {**kept, "passing": copy(self.passing)}
+
+    def put_back(self, kept: dict[str, object]) -> None:
+        """Let tracks be what they were when ``as_they_are`` was called."""
+        vars(self).update(kept)
 
     def renew(self, others: Ids) -> tuple[Ids, Ids]:
         """Give all tracks new ids, as if they began now, and ids kept elsewhere with them.

@@ -33,3 +33,17 @@ def cues(**changes):
 )
 def test_the_keyframe_rule(changes, wanted):
     assert wants_keyframe(cues(**changes)) is wanted
+
+
+@pytest.mark.parametrize(
+    ("changes", "wanted"),
+    [
+        ({"median_flow_px": 40.0}, True),
+        ({"num_inliers": 60}, False),  # it is the image that is bad
+        ({"num_inliers": 30, "median_flow_px": 40.0}, False),  # who knows whether that pose is true
+        ({"num_inliers": 60, "median_flow_px": 40.0, "usable_share": 0.4, "frames_since": 6}, True),
+        ({"num_inliers": 60, "median_flow_px": 40.0, "usable_share": 0.4}, False),
+    ],
+)
+def test_in_an_outage_only_another_view_makes_a_keyframe(changes, wanted):
+    assert wants_keyframe(cues(**changes), is_in_outage=True) is wanted

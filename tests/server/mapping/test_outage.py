@@ -88,6 +88,18 @@ def test_nothing_is_built_on_an_outage_and_tracks_outlive_it(room):
     assert ate_percent(trajectory, poses) < 1.0
 
 
+def test_a_camera_that_sees_something_else_by_now_goes_on_from_an_outage(room):
+    _, images = room
+    reconstruction = make()
+    for k in range(8):
+        reconstruction.process(frame_of(k, images[k], slot_snr_db=slots(0)))
+    half = slots(_NUM_SLOTS // 2)
+    through = [reconstruction.process(frame_of(k, images[k], slot_snr_db=half)) for k in (9, 12, 15)]
+    reconstruction.close()
+    assert all(r.num_tracked > 0 for r in through)
+    assert any(r.is_keyframe for r in through)
+
+
 def test_a_pose_of_an_outage_is_told_and_kept_like_any_other(room):
     _, images = room
     reconstruction, told = make(), []
