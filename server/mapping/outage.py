@@ -16,6 +16,8 @@ _LEAST_SHARE = 0.55
 #: The usual is what the best quarter of the frames of so long has at least. So an outage is taken for one for
 #: a second and a half; then a camera in a hand has seen something else, and tracks of before are of no use.
 _REMEMBERED_NS, _USUAL_QUANTILE = 2_000_000_000, 0.75
+#: And of no more frames than these.
+_MOST_FRAMES = 120
 #: SNR up to which a slot counts in full: decoded at -5 dB an image is soft, and has a third of its landmarks.
 _FULL_SNR = 10.0**-0.5
 
@@ -37,8 +39,8 @@ class Outage:
     def takes(self, frame: DecodedFrame) -> bool:
         """Note a frame, and tell whether it is one to be located only."""
         share = share_received(frame)
-        since_ns = frame.t_source_ns - _REMEMBERED_NS
-        self._shares = [(t_ns, seen) for t_ns, seen in self._shares if t_ns > since_ns]
-        self._shares.append((frame.t_source_ns, share))
+        now_ns = frame.t_source_ns  # which may stand still, or begin again where a video is repeated
+        late = [(t_ns, seen) for t_ns, seen in self._shares if abs(now_ns - t_ns) < _REMEMBERED_NS]
+        self._shares = [*late[-_MOST_FRAMES:], (now_ns, share)]
         usual = np.quantile([seen for _, seen in self._shares], _USUAL_QUANTILE)
         return share < _LEAST_SHARE * float(usual)

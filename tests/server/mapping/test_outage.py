@@ -6,7 +6,7 @@ from drawn_boards import CAMERA, ate_percent, frame_of, make
 
 from semcast.common.phy.slots import BLOCK_PX
 from semcast.server.mapping.outage import Outage, share_received
-from semcast.server.mapping.state import TrackingState
+from semcast.server.mapping.state import DecodedFrame, TrackingState
 
 _NUM_SLOTS = CAMERA.height // BLOCK_PX
 
@@ -45,6 +45,17 @@ def test_an_outage_is_told_by_what_came_before_and_is_over_when_it_lasts(room):
     took = [outage.takes(frame_with(0.4, k, image)) for k in range(21, 51)]
     assert took[:14] == [True] * 14
     assert not any(took[16:]), "the link is like that now"
+
+
+@pytest.mark.parametrize("step_ns", [0, -10_000_000_000])
+def test_times_that_stand_still_or_begin_again_are_expected(room, step_ns):
+    outage, image = Outage(), room[1][0]
+    for k in range(300):
+        outage.takes(DecodedFrame(k, k * step_ns, image, slot_snr_db=slots(0)))
+    assert len(outage._shares) <= 121
+    took = [outage.takes(DecodedFrame(k, 300 * step_ns, image, slot_snr_db=slots(10))) for k in range(200)]
+    assert took[0] == (step_ns == 0)
+    assert not took[-1]
 
 
 def test_a_link_that_loses_one_slot_in_five_has_no_outage(room):
