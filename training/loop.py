@@ -17,7 +17,7 @@ import torch
 import torch.distributed as dist
 from numpy.typing import NDArray
 
-from semcast.common.errors import CheckpointError, SemcastError, SourceError
+from semcast.common.errors import CheckpointError, ConfigError, SemcastError, SourceError
 from semcast.common.nets.checkpoint import load_transceiver, save_transceiver
 from semcast.common.nets.codec import check_device
 from semcast.common.nets.precision import has_fast_bfloat16
@@ -93,6 +93,8 @@ class Run:
         check_device(settings.device)
         if rank == 0:
             check_writable(self.checkpoint_path, "out")  # not after the first thousand steps
+        if settings.grow_from is not None and not settings.grow_from.is_file():
+            raise ConfigError(f"grow_from must be a file of weights, got {settings.grow_from}: no such file")
         use_cuda = settings.device == "cuda" or (settings.device == "auto" and torch.cuda.is_available())
         local = int(os.environ.get("LOCAL_RANK", "0"))
         self.device = torch.device("cuda", local) if use_cuda else torch.device("cpu")

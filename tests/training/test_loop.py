@@ -297,6 +297,14 @@ def test_a_folder_of_images_that_is_not_there_is_named_with_its_flag(photos, tmp
         train(settings)
 
 
+def test_a_network_to_grow_from_must_be_there_also_where_a_checkpoint_is(tiny_network, photos, tmp_path):
+    missing = tmp_path / "nowhere.safetensors"
+    train(settings_for(photos, tmp_path / "old", steps=1))
+    for out in (tmp_path / "new", tmp_path / "old"):
+        with pytest.raises(ConfigError, match="grow_from must be a file of weights, got .*nowhere"):
+            train(settings_for(photos, out, steps=1, grow_from=missing))
+
+
 def test_what_a_run_could_not_do_later_is_said_before_it_begins(tiny_network, photos, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match="out can't be written to .*last.pt: Not a directory"):
