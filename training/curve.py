@@ -20,6 +20,19 @@ def append_row(path: Path, row: dict[str, Any]) -> None:
         file.write(json.dumps(row) + "\n")
 
 
+def append_validation(path: Path, step: int, elapsed_s: float, valid: dict[str, float]) -> None:
+    """Add the validation of a step, in place of an earlier one of the same step.
+
+    A run that has ended, and is run again, is validated again.
+    """
+    if path.is_file():
+        lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+        kept = [line for line in lines if not (_step_of(line) == step and "valid" in json.loads(line))]
+        if len(kept) < len(lines):
+            write_whole(path, "".join(kept))
+    append_row(path, {"step": step, "elapsed_s": round(elapsed_s, 1), "valid": valid})
+
+
 def cut_to_step(path: Path, step: int) -> None:
     """Leave out what a run reported after the step it goes on from, and a line it was killed in.
 

@@ -28,7 +28,7 @@ from semcast.common.source_commit import source_commit
 from semcast.common.whole_file import check_writable, write_whole
 from semcast.training.centring import centre_hidden, folded, unfolded
 from semcast.training.channel import to_device
-from semcast.training.curve import CURVE_NAME, append_row, cut_to_step, mean_of
+from semcast.training.curve import CURVE_NAME, append_row, append_validation, cut_to_step, mean_of
 from semcast.training.data import Ahead, Crops, read_images
 from semcast.training.draws import Draws, seed_of_step
 from semcast.training.growing import grow
@@ -439,7 +439,7 @@ def _train(
             is_end = run.share_done() >= 1.0  # which is validated below
             if run.step % settings.valid_every == 0 and run.valid_images and run.rank == 0 and not is_end:
                 valid = validate(run.shippable(), run.valid_images, run.device, run.bf16)
-                append_row(log, {"step": run.step, "elapsed_s": round(run.elapsed_s, 1), "valid": valid})
+                append_validation(log, run.step, run.elapsed_s, valid)
             if run.step % settings.save_every == 0:
                 run.save()
     finally:
@@ -451,7 +451,7 @@ def _train(
         model = run.shippable()  # as long as some dozens of steps take
         if run.valid_images:
             valid = validate(model, run.valid_images, run.device, run.bf16)
-            append_row(log, {"step": run.step, "elapsed_s": round(run.elapsed_s, 1), "valid": valid})
+            append_validation(log, run.step, run.elapsed_s, valid)
         weights = run.export(model, valid)
     return TrainResult(run.step, run.elapsed_s, weights, valid)
 

@@ -151,6 +151,14 @@ def test_the_curve_of_a_run_that_was_killed_has_each_step_once(tiny_network, pho
     assert rows[1]["loss"] != 9.0
 
 
+def test_a_finished_run_that_is_run_again_has_its_validation_once(tiny_network, photos, tmp_path):
+    settings = settings_for(photos, tmp_path, steps=2, valid=photos)
+    train(settings)
+    once = (tmp_path / "log.jsonl").read_text()
+    train(settings)
+    assert (tmp_path / "log.jsonl").read_text() == once
+
+
 def test_the_weights_change_and_the_seed_decides_how(tiny_network, photos, tmp_path):
     for name, seed in (("a", 0), ("b", 0), ("c", 1)):
         train(settings_for(photos, tmp_path / name, steps=2, seed=seed))
