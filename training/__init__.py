@@ -7,6 +7,7 @@ Run
     muon          the Muon optimiser
     validation    PSNR of whole images
     curve         loss and PSNR over the steps
+    divergence    losses and weights that are no longer finite
 
 Data
     data          images, and crops cut and changed at random

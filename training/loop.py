@@ -30,6 +30,7 @@ from semcast.training.centring import centre_hidden, folded, unfolded
 from semcast.training.channel import to_device
 from semcast.training.curve import CURVE_NAME, append_row, append_validation, cut_to_step, mean_of
 from semcast.training.data import Ahead, Crops, read_images
+from semcast.training.divergence import Divergence
 from semcast.training.draws import Draws, seed_of_step
 from semcast.training.growing import grow
 from semcast.training.klt import start_from_klt
@@ -108,6 +109,8 @@ class Run:
         valid = settings.valid
         self.valid_images = _images_of(valid, "--valid")[:_VALID_IMAGES] if valid else []
         self.step, self.elapsed_s = 0, 0.0
+        self.saved_step: int | None = None
+        self.divergence = Divergence()
         self.agreed_s = 0.0  # elapsed time all processes agree on, since the schedule depends on it
         self._is_asked_to_stop = self.agreed_stop = False
         self.snr_range_db = (settings.channel.snr_min_db, settings.channel.snr_max_db)
@@ -195,13 +198,18 @@ class Run:
             for group, values in zip(optimiser.param_groups, groups, strict=True):
                 group.update(values)
         self.step, self.elapsed_s = state["step"], state["elapsed_s"]
+        self.saved_step = self.step
         if self.settings.only_heads:
             self.snr_range_db = state.get("snr_range_db", self.snr_range_db)  # not in those of older code
         self.agreed_s = self.elapsed_s
 
+    def breakdown(self) -> str | None:
+        """Return what has gone wrong with weights or losses, None while the run can go on."""
+        return self.divergence.found_in(self.weights + self.averages)
+
     def save(self) -> None:
-        """Write the checkpoint and the averaged weights; a crash while writing leaves the old ones."""
-        if self.rank:
+        """Write the checkpoint; a crash while writing leaves the old one, and so does a breakdown."""
+        if self.rank or self.breakdown() is not None:
             return
         self.settings.out.mkdir(parents=True, exist_ok=True)
         state = {
@@ -217,6 +225,7 @@ class Run:
         packed = io.BytesIO()  # torch gives an error of its own where a disk is full
         torch.save(state, packed)
         write_whole(self.checkpoint_path, packed.getvalue())
+        self.saved_step = self.step
 
     def shippable(self) -> Transceiver:
         """Return the averaged weights as they run without the aids of training."""
@@ -386,7 +395,8 @@ def train(
         CheckpointError: The checkpoint in ``out`` belongs to another architecture or other optimisers, or is
             damaged.
         ConfigError: ``start`` or ``grow_from`` does not suit the architecture.
-        SemcastError: Checkpoint, curve or weights can't be written; what was there of them before stays.
+        SemcastError: Checkpoint, curve or weights can't be written, or losses or weights aren't finite;
+            what was there before stays.
     """
     world = int(os.environ.get("WORLD_SIZE", "1"))
     joined = world > 1 and not dist.is_initialized()
@@ -424,8 +434,12 @@ def _train(
             row = run.one_step()
             if run.rank == 0:  # the others log nothing
                 rows.append(row)
+                run.divergence.add(run.step, row["loss"])
             run.elapsed_s += time.perf_counter() - start_s
-            is_logged = run.step % settings.log_every == 0
+            is_logged, is_saved = run.step % settings.log_every == 0, run.step % settings.save_every == 0
+            if run.rank == 0 and (is_logged or is_saved) and run.breakdown() is not None:
+                run.ask_to_stop()
+                continue
             if run.rank == 0 and (is_logged or is_first):
                 report = Progress(run.step, run.elapsed_s, run.share_done(), mean_of(rows))
                 if is_logged:
@@ -440,13 +454,14 @@ def _train(
             if run.step % settings.valid_every == 0 and run.valid_images and run.rank == 0 and not is_end:
                 valid = validate(run.shippable(), run.valid_images, run.device, run.bf16)
                 append_validation(log, run.step, run.elapsed_s, valid)
-            if run.step % settings.save_every == 0:
+            if is_saved and run.divergence.is_newest_finite():
                 run.save()
     finally:
         run.ahead.close()
         run.save()
     weights = settings.out / f"{settings.architecture}.safetensors"
     if run.rank == 0:
+        _check(run)
         logger.info("step %d was the last; the weights are averaged, validated and written", run.step)
         model = run.shippable()  # as long as some dozens of steps take
         if run.valid_images:
@@ -454,6 +469,17 @@ def _train(
             append_validation(log, run.step, run.elapsed_s, valid)
         weights = run.export(model, valid)
     return TrainResult(run.step, run.elapsed_s, weights, valid)
+
+
+def _check(run: Run) -> None:
+    broken = run.breakdown()
+    if broken is not None:
+        saved = "no checkpoint was written"
+        if run.saved_step is not None:
+            saved = f"the checkpoint of step {run.saved_step} stays"
+        raise SemcastError(
+            f"training into {run.settings.out} broke down by step {run.step}: {broken}; {saved}"
+        )
 
 
 def _images_of(folder: Path, flag: str) -> list[NDArray[np.uint8]]:

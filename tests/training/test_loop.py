@@ -3,6 +3,7 @@ import io
 import json
 import math
 import os
+import re
 import resource
 import shutil
 import socket
@@ -218,6 +219,35 @@ def test_a_gradient_that_is_not_finite_spoils_nothing(tiny_network, photos, tmp_
     train(settings_for(photos, tmp_path / "out"))
     assert len(steps) == 6
     assert all(torch.isfinite(weight).all() for weight in final_state(tmp_path / "out")["model"].values())
+
+
+def test_losses_that_stay_not_finite_end_a_run_and_its_sound_checkpoint_stays(
+    tiny_network, photos, tmp_path, monkeypatch
+):
+    real = loop.transceiver_loss
+    steps = []
+
+    def finite_no_longer(*args):
+        steps.append(len(steps) + 1)
+        loss, logs = real(*args)
+        return (loss * math.nan if steps[-1] > 7 else loss), logs
+
+    monkeypatch.setattr(loop, "transceiver_loss", finite_no_longer)
+    with pytest.raises(SemcastError) as raised:
+        train(settings_for(photos, tmp_path, steps=100))
+    message = (
+        r"broke down by step 18: the last 11 losses are not finite, the last finite loss was [\d.]+ in step 7"
+    )
+    assert re.search(message, str(raised.value))
+    assert str(raised.value).endswith("; the checkpoint of step 6 stays")
+    assert final_state(tmp_path)["step"] == 6
+    assert not (tmp_path / "3dcsc.safetensors").exists()
+
+
+def test_weights_that_half_precision_has_no_room_for_end_a_run(tiny_network, photos, tmp_path):
+    with pytest.raises(SemcastError, match="broke down by step 2: weights are not finite in half precision"):
+        train(settings_for(photos, tmp_path, lr=1e30, warmup_steps=0))
+    assert not list(tmp_path.glob("*.safetensors")) + list(tmp_path.glob("*.pt"))
 
 
 def test_a_run_can_begin_with_analog_links(tiny_network, photos, tmp_path):
