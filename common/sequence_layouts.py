@@ -4,6 +4,7 @@ Images are not opened here. Poses are brought to ``T_world_cam`` of the camera w
 """
 
 import logging
+import re
 import shlex
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ from semcast.common.geometry import make_transform, project_to_so3, rotation_fro
 from semcast.common.image_order import in_order, order_of
 from semcast.common.numbered_images import lines_of_images, numbers_in_names
 from semcast.common.ros_bag_files import check_no_ros_bag
-from semcast.common.text_rows import text_rows
+from semcast.common.text_rows import TextRow, text_rows
 from semcast.common.trajectory import Trajectory, read_tum, seconds_of
 from semcast.common.transforms_file import read_transforms_json
 
@@ -33,6 +34,9 @@ Row = TypeVar("Row")
 Layout = Literal["auto", "native", "tum", "kitti", "euroc", "transforms", "colmap", "folder"]
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp")
+_ENDINGS = "|".join(suffix[1:] for suffix in IMAGE_SUFFIXES)
+#: What follows the time in a line of a list of images, as far as the first end of an image's name.
+_IMAGE_NAME = re.compile(rf"[^\s,]+[\s,]+(.+?\.({_ENDINGS}))(?=[\s,]|$)", re.IGNORECASE)
 _TRANSFORMS_NAMES = ("transforms.json", "transforms_test.json", "transforms_train.json")
 _CALIBRATION_NAMES = ("intrinsics.json", "intrinsics.yaml", "camera.yaml", "calibration.yaml", "sensor.yaml")
 _TIMES_NAME = "times.txt"
@@ -222,21 +226,27 @@ def _nominal_times_ns(count: int, rate_hz: float) -> NDArray[np.int64]:
     return np.round(np.arange(count) * (1e9 / rate_hz)).astype(np.int64)
 
 
-def _rows(path: Path, at_least: int, read: Callable[[list[str]], Row]) -> list[Row]:
-    """Return what ``read`` makes of the blank- or comma-separated fields of each line that is no comment.
+def _rows(path: Path, at_least: int, read: Callable[[TextRow], Row]) -> list[Row]:
+    """Return what ``read`` makes of each line that is no comment.
 
     Raises:
         SourceError: The file can't be read, or ``read`` raises ``ValueError`` for a line.
     """
     rows: list[Row] = []
-    for number, line, fields in text_rows(path):
-        if len(fields) < at_least:
-            raise SourceError(f"{path}:{number} must have {at_least} fields, got {line!r}")
+    for row in text_rows(path):
+        if len(row.fields) < at_least:
+            raise SourceError(f"{path}:{row.number} must have {at_least} fields, got {row.line!r}")
         try:
-            rows.append(read(fields))
+            rows.append(read(row))
         except ValueError as err:
-            raise SourceError(f"{path}:{number}: {err}") from err
+            raise SourceError(f"{path}:{row.number}: {err}") from err
     return rows
+
+
+def _image_name(row: TextRow) -> str:
+    """Return the second field; blanks and commas may be part of it."""
+    found = _IMAGE_NAME.match(row.line.split("#", 1)[0].strip())
+    return found[1] if found else row.fields[1]
 
 
 def _finite(numbers: list[str], count: int) -> NDArray[np.float64]:
@@ -255,7 +265,7 @@ def _finite(numbers: list[str], count: int) -> NDArray[np.float64]:
 
 
 def _read_times_ns(path: Path) -> NDArray[np.int64]:
-    return np.array(_rows(path, 1, lambda fields: seconds_to_ns(fields[0])), dtype=np.int64)
+    return np.array(_rows(path, 1, lambda row: seconds_to_ns(row.fields[0])), dtype=np.int64)
 
 
 def _calibration_beside(folder: Path) -> Callable[[int, int], Intrinsics | None]:
@@ -294,7 +304,7 @@ def _with_what_lies_beside(path: Path, images: tuple[Path, ...], rate_hz: float)
 
 def _read_tum_folder(path: Path, rate_hz: float) -> SequenceFiles:
     del rate_hz
-    rows = _rows(path / "rgb.txt", 2, lambda fields: (seconds_to_ns(fields[0]), path / fields[1]))
+    rows = _rows(path / "rgb.txt", 2, lambda row: (seconds_to_ns(row.fields[0]), path / _image_name(row)))
     beside = _calibration_beside(path)
     name = path.resolve().name
 
@@ -377,7 +387,7 @@ def kitti_pose_places(path: Path) -> tuple[Path, Path, Path]:
 def _kitti_projection(path: Path, camera_idx: int) -> NDArray[np.float64] | None:
     if not path.is_file():
         return None
-    for label, *numbers in _rows(path, 1, list):
+    for label, *numbers in _rows(path, 1, lambda row: row.fields):
         if label.rstrip(":") == f"P{camera_idx}":
             try:
                 projection = _finite(numbers, 12).reshape(3, 4)
@@ -392,7 +402,7 @@ def _kitti_projection(path: Path, camera_idx: int) -> NDArray[np.float64] | None
 
 
 def _kitti_poses(path: Path) -> NDArray[np.float64]:
-    rows = _rows(path, 12, lambda fields: _finite(fields, 12).reshape(3, 4))
+    rows = _rows(path, 12, lambda row: _finite(row.fields, 12).reshape(3, 4))
     return np.array([make_transform(project_to_so3(row[:, :3]), row[:, 3]) for row in rows]).reshape(-1, 4, 4)
 
 
@@ -406,7 +416,9 @@ def _read_euroc(path: Path, rate_hz: float) -> SequenceFiles:
     folder = _euroc_camera_folder(path)
     if folder is None:
         raise SourceError(f"{path} must have mav0/cam0/data.csv and mav0/cam0/data to be a EuRoC sequence")
-    rows = _rows(folder / "data.csv", 2, lambda fields: (_whole_ns(fields[0]), folder / "data" / fields[1]))
+    rows = _rows(
+        folder / "data.csv", 2, lambda row: (_whole_ns(row.fields[0]), folder / "data" / _image_name(row))
+    )
     sensor = folder / "sensor.yaml"
     name = path.resolve().name
     return SequenceFiles(
@@ -439,10 +451,10 @@ def _euroc_truth(path: Path, sensor: Path) -> Trajectory | None:
     if T_body_cam is None:
         raise SourceError(f"{sensor} has no T_BS")
 
-    def pose(fields: list[str]) -> tuple[int, NDArray[np.float64]]:
-        px, py, pz, *quat_wxyz = _finite(fields[1:8], 7).tolist()
+    def pose(row: TextRow) -> tuple[int, NDArray[np.float64]]:
+        px, py, pz, *quat_wxyz = _finite(row.fields[1:8], 7).tolist()
         T_world_body = make_transform(rotation_from_quat_wxyz(quat_wxyz), (px, py, pz))
-        return _whole_ns(fields[0]), T_world_body @ T_body_cam
+        return _whole_ns(row.fields[0]), T_world_body @ T_body_cam
 
     rows = _rows(path, 8, pose)
     times_ns = np.array([t_ns for t_ns, _ in rows], np.int64)

@@ -8,7 +8,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.errors import SourceError
 from semcast.common.geometry import exp_so3, invert_transform, make_transform, quat_wxyz_from_rotation
 from semcast.common.sequence import open_sequence, truth_at_frames
-from semcast.common.sequence_layouts import kitti_pose_places
+from semcast.common.sequence_layouts import kitti_pose_places, read_layout
 from semcast.common.trajectory import Trajectory, write_tum
 
 CAMERA = Intrinsics(fx=30.0, fy=31.0, cx=15.5, cy=11.5, width=32, height=24)
@@ -40,6 +40,17 @@ def test_tum_layout_interpolates_truth_between_its_own_times(tmp_path, write_ima
     assert len(found) == 2, "the last frame has no pose on both sides"
     expected = make_transform(exp_so3([0.0, 0.05, 0.0]), (0.25, 0.0, 0.1))
     np.testing.assert_allclose(found.T_world_cam[0], expected, atol=1e-5)
+
+
+def test_names_of_images_in_a_list_may_hold_blanks_and_commas(tmp_path, write_images):
+    names = ["my photo 1.png", "b, c.PNG", "three.png"]
+    for name in names:
+        write_images(tmp_path / "my rgb", 1, name)
+    (tmp_path / "rgb.txt").write_text(
+        f"0.5 my rgb/{names[0]}\n1.5\tmy rgb/{names[1]} 1.5 depth/1.png\n2.5,my rgb/{names[2]}  # the last\n"
+    )
+    assert [path.name for path in read_layout(tmp_path, "auto", 10.0).image_paths] == names
+    assert open_sequence(tmp_path).refused_images()[0] == []
 
 
 def test_truth_is_not_stretched_over_gaps(poses):
