@@ -227,13 +227,15 @@ def _nominal_times_ns(count: int, rate_hz: float) -> NDArray[np.int64]:
 
 
 def _rows(path: Path, at_least: int, read: Callable[[TextRow], Row]) -> list[Row]:
-    """Return what ``read`` makes of each line that is no comment.
+    """Return what ``read`` makes of each line that is no comment, nor a first one that names the columns.
 
     Raises:
         SourceError: The file can't be read, or ``read`` raises ``ValueError`` for a line.
     """
     rows: list[Row] = []
-    for row in text_rows(path):
+    for k, row in enumerate(text_rows(path)):
+        if k == 0 and row.fields[0].lower().startswith("time"):
+            continue
         if len(row.fields) < at_least:
             raise SourceError(f"{path}:{row.number} must have {at_least} fields, got {row.line!r}")
         try:

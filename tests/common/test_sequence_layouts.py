@@ -208,6 +208,22 @@ def test_euroc_layout_gives_poses_of_the_camera_not_of_the_body(tmp_path, write_
         open_sequence(folder)
 
 
+@pytest.mark.parametrize(
+    "header", ["#timestamp [ns],filename\n", "timestamp [ns],filename\n", "Time,File\n", ""]
+)
+def test_the_line_that_names_the_columns_of_a_euroc_list_need_not_be_a_comment(
+    tmp_path, write_images, header
+):
+    cam = tmp_path / "mav0" / "cam0"
+    write_images(cam / "data", 2, "{:d}.png")
+    (cam / "data.csv").write_text(f"{header}1403636579763555584,0.png\n1403636579813555456,1.png\n")
+    times_ns = [1403636579763555584, 1403636579813555456]
+    np.testing.assert_array_equal(open_sequence(tmp_path).times_ns, times_ns)
+    (cam / "data.csv").write_text(f"{header}1403636579763555584,0.png\ntimestamp,1.png\n")
+    with pytest.raises(SourceError, match="time must be whole nanoseconds, got 'timestamp'"):
+        open_sequence(tmp_path)
+
+
 def test_a_list_of_images_that_a_power_cut_filled_with_zeros_is_told(tmp_path, write_images):
     folder = tmp_path / "desk"
     write_images(folder / "rgb", 2, "{:d}.png")
