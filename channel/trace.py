@@ -114,6 +114,8 @@ def _numbers(row: dict[str, str], names: tuple[str, ...], where: str) -> list[fl
 def read_trace_csv(path: Path | str) -> FileTrace:
     """Read a trace with the columns ``t_s,snr_db`` and perhaps ``slot_loss``, named in a header line.
 
+    Lines that begin with ``#`` are comments.
+
     Raises:
         ConfigError: The file can't be read, a column is missing, a value is no number or out of range, times
             don't increase or there is no row. The message names the line.
@@ -129,7 +131,8 @@ def read_trace_csv(path: Path | str) -> FileTrace:
         if path.stat().st_size > _MAX_BYTES:
             raise ConfigError(f"{path} must be an SNR trace of at most {_MAX_BYTES >> 20} MB, got more")
         with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = csv.DictReader(file)
+            lines = {k: line for k, line in enumerate(file, start=1) if not line.lstrip().startswith("#")}
+            rows, numbers = csv.DictReader(lines.values()), list(lines)
             names = [name.strip() for name in rows.fieldnames or []]
             rows.fieldnames = names
             if not {"t_s", "snr_db"} <= set(names):
@@ -137,7 +140,7 @@ def read_trace_csv(path: Path | str) -> FileTrace:
                 raise ConfigError(f"{path} must name the columns t_s,snr_db in its first line")
             columns = ("t_s", "snr_db", *(["slot_loss"] if "slot_loss" in names else []))
             for row in rows:
-                where = f"{path} line {rows.line_num}"
+                where = f"{path} line {numbers[rows.line_num - 1]}"
                 t_s, value_db, *loss = _numbers(row, columns, where)
                 if not low <= value_db <= high:
                     raise ConfigError(f"{where}: snr_db must be in [{low:g}, {high:g}], got {value_db:g}")

@@ -69,6 +69,16 @@ def test_a_file_on_any_clock_begins_with_the_first_frame_and_may_tell_losses(tmp
     assert read_trace_csv(str(path)).slot_loss(5.0) == 0
 
 
+def test_comments_are_left_out_of_a_file_and_lines_keep_their_numbers(tmp_path):
+    path = tmp_path / "trace.csv"
+    path.write_text("# of 3 May\n#\nt_s,snr_db\n0,10\n # a tunnel\n2,4\n")
+    trace = read_trace_csv(path)
+    assert [trace.snr_db(t) for t in (0, 1, 2)] == [10, 7, 4]
+    path.write_text(path.read_text() + "# out of it\n3,none\n")
+    with pytest.raises(ConfigError, match="line 8: t_s and snr_db must be numbers, got '3', 'none'"):
+        read_trace_csv(path)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
