@@ -43,8 +43,11 @@ def wait_for_peers(session: Session, agent_id: str, peers: Collection[str], stop
         pass
 
 
-def wait_until_ready(session: Session, agent_id: str, agent_epoch: int, stop: threading.Event) -> None:
+def wait_until_ready(session: Session, agent_id: str, agent_epoch: int, stop: threading.Event) -> bool:
     """Wait until the server has its decoder, map and viewer ready for this stream, at most a while.
+
+    Returns:
+        Whether it has said so.
 
     Raises:
         TransportError: The session is closed.
@@ -60,3 +63,4 @@ def wait_until_ready(session: Session, agent_id: str, agent_epoch: int, stop: th
     until_s = time.monotonic() + READY_S
     while not stop.is_set() and not ready.wait(_POLL_S) and time.monotonic() < until_s:
         pass
+    return ready.is_set()

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from semcast.agent.peers import wait_for_peers, wait_until_ready
+from semcast.agent.peers import READY_S, wait_for_peers, wait_until_ready
 from semcast.common.errors import SourceError
 from semcast.common.keys import camera_key, channel_key, check_agent_id, rx_key, source_key, tx_key
 from semcast.common.messages import MAX_MISSING, ChannelReport, SourceImage, SymbolFrame
@@ -28,6 +28,10 @@ logger = logging.getLogger(__name__)
 Played = SymbolFrame | ChannelReport | SourceImage
 
 _CLASSES: dict[str, type[Played]] = {"symbols": SymbolFrame, "channel": ChannelReport, "source": SourceImage}
+_NOT_READY = (
+    f"in {READY_S:g} s the server has not said that it is ready: see its log; in --mode replay it takes "
+    "nothing that is played"
+)
 #: Between two messages; the recorder's clock may have been set meanwhile, by years on a machine without one.
 _LONGEST_PAUSE_S = 60.0
 
@@ -229,7 +233,9 @@ def run_play(settings: PlaySettings, stop: threading.Event) -> dict[str, Any]:
             session.declare_alive(agent_id, role)
         if settings.wait:
             wait_for_peers(session, agent_id, {"server"} if is_received else {"server", "channel"}, stop)
-            wait_until_ready(session, agent_id, sending.agent_epoch, stop)
+            is_ready = wait_until_ready(session, agent_id, sending.agent_epoch, stop)
+            if not is_ready and not stop.is_set():
+                logger.warning("%s", _NOT_READY)
         if not stop.is_set():
             what = f"{settings.file} as {agent_id!r}, {settings.symbols} symbols, pace {settings.pace:g}"
             logger.info("playing %s", what)

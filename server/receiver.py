@@ -239,8 +239,9 @@ class Receiver:
 
     def _tell_of_mode(self, lossless: bool) -> None:
         there = "replay" if lossless else "live"
+        what = "" if lossless else ", live for 'semcast play'"
         self._complaints.tell(
-            "mode", f"the agent runs in {there} mode, this server in {self._mode}: give both one --mode"
+            "mode", f"the agent runs in {there} mode, this server in {self._mode}: give both one --mode{what}"
         )
 
     def _sort(self, frame: SymbolFrame, arrival_ns: int) -> None:

@@ -107,7 +107,7 @@ def file(tmp_path, codec):
 class Bench:
     """A hub with a server's receiver, and ears for everything that is sent."""
 
-    def __init__(self, agent_id=AGENT):
+    def __init__(self, agent_id=AGENT, mode="live"):
         self.hub, self.endpoint = open_hub()
         self.network = NetworkSettings(connect=(self.endpoint,))
         self.metrics = Metrics("server")
@@ -116,7 +116,7 @@ class Bench:
         self.heard |= {"status/agent": [], "status/channel": []}
         for name, heard in self.heard.items():
             self.hub.subscribe(f"semcast/{agent_id}/{name}", "every", heard.append)
-        self.receiver = Receiver(self.hub, agent_id, "live", self.metrics)
+        self.receiver = Receiver(self.hub, agent_id, mode, self.metrics)
         self.threads = []
 
     def messages(self, name, kind):
@@ -179,7 +179,7 @@ def bench():
         yield opened
 
 
-def test_a_server_receives_what_the_link_made_of_the_frames_as_a_new_stream(bench, file, codec):
+def test_a_server_receives_what_the_link_made_of_the_frames_as_a_new_stream(bench, file, codec, caplog):
     bench.begin_server()
     before_ns, before_mono_ns = time.time_ns(), time.monotonic_ns()
     play = bench.play(file)
@@ -203,6 +203,19 @@ def test_a_server_receives_what_the_link_made_of_the_frames_as_a_new_stream(benc
     assert {(m.agent_epoch, m.snr_db_set) for m in reports} == {(epoch, 20.0)}
     assert not bench.heard["tx/symbols"], "a channel would send them on"
     assert bench.metrics.drops == {}
+    assert not [record for record in caplog.records if record.levelno >= logging.WARNING]
+
+
+def test_a_server_in_replay_mode_and_what_plays_to_it_say_why_nothing_comes_of_it(file, caplog, monkeypatch):
+    monkeypatch.setattr("semcast.agent.peers.READY_S", 0.3)
+    with contextlib.closing(Bench(mode="replay")) as bench:
+        bench.begin_server()
+        play = bench.play(file)
+        play.join(30)
+        until(lambda: bench.metrics.drops.get("mode") == NUM_FRAMES, "the frames, which it takes none of")
+    assert "the server has not said that it is ready: see its log; in --mode replay" in caplog.text
+    said = "the agent runs in live mode, this server in replay: give both one --mode, live for 'semcast play'"
+    assert said in caplog.text
 
 
 def test_the_end_of_a_played_stream_is_told(bench, file):
