@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from semcast.evaluation.trace_snr import snr_heading
+from semcast.evaluation.trace_snr import snr_heading, trace_notes
 
 Report = Mapping[str, Any]
 #: A column that has another name, or none, where the SNR follows a trace.
@@ -60,7 +60,7 @@ def result_table(what: str, report: Report) -> ResultTable:
     }
     rows = [[_cell(entry, *column) for column in columns.values()] for entry in entries]
     partial = ["Partial: interrupted before all was measured."] if report.get("partial") else []
-    return ResultTable(list(columns), rows, [*partial, *layout.notes(report)])
+    return ResultTable(list(columns), rows, [*partial, *trace_notes(report), *layout.notes(report)])
 
 
 def _cell(row: Mapping[str, Any], where: str, form: str) -> str:

@@ -53,6 +53,17 @@ def snr_heading(report: Mapping[str, Any]) -> str | None:
     return None if link.get("trace") == "file" else "start dB"
 
 
+def trace_notes(report: Mapping[str, Any]) -> list[str]:
+    """Return what stands below the table of a result for SNRs that no column has: the name of their file."""
+    settings = report.get("settings", {})
+    link = settings.get("link") or {}
+    is_sent = settings.get("codec") != "none" and (link.get("channel"), link.get("trace")) == (
+        "trace",
+        "file",
+    )
+    return [f"SNR and losses are those of {link['trace_file']}."] if is_sent else []
+
+
 def level_name(snr_db: float | None, report: Mapping[str, Any], unit: str = "") -> str:
     """Name an SNR of a report; None is that of a trace from a file, or stands for original images."""
     if snr_db is None:

@@ -84,6 +84,16 @@ def test_figures_of_published_poses_fit_beside_those_of_the_corrected_path():
     assert [line.split() for line in body] == table.rows
 
 
+def test_the_file_of_a_trace_is_named_where_no_column_has_its_snr():
+    report = json.loads((RESULTS / "trajectory_outages_shelf_50.json").read_text(encoding="utf-8"))
+    table = result_table("trajectory", report)
+    assert "SNR dB" not in table.head
+    assert table.notes[0] == "SNR and losses are those of deploy/demo/outages.csv."
+    report["settings"]["codec"] = "none"
+    assert not any("outages.csv" in note for note in result_table("trajectory", report).notes)
+    assert not any("losses" in note for note in result_table("trajectory", shipped("trajectory")).notes)
+
+
 def test_figures_of_a_cloud_are_told_below_the_table():
     report = shipped("depth")
     cloud = {"points": 1234.5, "accuracy_median": 0.0031, "accuracy_p90": None, "completeness": 0.4}
