@@ -83,9 +83,9 @@ def export_run(
         raise SourceError(f"{folder} has no posed frame, so there is nothing to export")
     parts = parts_line(count_parts(data.frame_submap.tolist()))
     whole = parts is None or part == ALL
+    data = select_part(data, part)
     if format_name == "dense" and not whole:
         raise ConfigError("--part must be all for --format dense: its points do not know their part")
-    data = select_part(data, part)
     images = read_image_paths(folder)
     placement = None
     if find_placement is not None:

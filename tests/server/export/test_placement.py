@@ -374,6 +374,8 @@ def test_placements_that_can_not_be_are_refused_in_one_line(tmp_path, marker_run
     write_ply(tmp_path / "run" / "dense.ply", data.xyz, data.rgb, data.confidence)
     assert export(tmp_path, "--format", "dense", "--part", "largest", *out) == 1
     assert "--part must be all for --format dense" in capsys.readouterr().err
+    assert export(tmp_path, "--format", "dense", "--part", "9", *out) == 1
+    assert capsys.readouterr().err == "semcast export: --part must be one of 0, 1, got 9\n"
     assert export(tmp_path, "--format", "dense", "--marker-m", 0.3, *out) == 1
     assert "--format dense can't be placed here: " in capsys.readouterr().err
     assert not (tmp_path / "x").exists()
