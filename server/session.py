@@ -31,6 +31,7 @@ from semcast.server.checkpoint import Checkpoint, CheckpointHeader, CheckpointWr
 from semcast.server.decoder import Arrival
 from semcast.server.dense.cloud import DensePatch
 from semcast.server.export.outputs import EachFile, versions, write_json, write_ply
+from semcast.server.export.parts import after_gaps
 from semcast.server.former_run import set_aside
 from semcast.server.frame_rows import FrameRow, FrameRows, run_line, summarise, too_much
 from semcast.server.frame_views import frame_view
@@ -125,11 +126,12 @@ class Session:
             except BaseException:
                 self.close()
                 raise
-        for row in self._record.rows():
+        for row in (rows := self._record.rows()):
             self._t_source_ns[row.frame_id] = row.t_source_ns
             self._numbers[row.frame_id] = row.seq
         #: Poses of a restored map that the viewer has not seen yet.
         self._restored = self._reconstruction.final_trajectory() if self.resumed else {}
+        self._after_gaps = after_gaps(self._restored, (row.frame_id for row in rows if not row.posed))
 
     def _open(self, folder: Path) -> None:
         """Take up what a folder holds of this stream, and begin to write into it."""
@@ -253,7 +255,8 @@ class Session:
         view = frame_view(frame, result, row, arrival.drops)
         if self._restored:
             restored = [(k, self._t_source_ns.get(k, 0), T) for k, T in sorted(self._restored.items())]
-            view = replace(view, backfilled=(*restored, *view.backfilled))
+            backfilled = (*restored, *view.backfilled)
+            view = replace(view, backfilled=backfilled, after_gaps=self._after_gaps)
             self._restored = {}
         return Outcome(result, update, view, patches)
 

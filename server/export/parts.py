@@ -39,6 +39,19 @@ def parts_line(parts: Sequence[Mapping[str, int]]) -> str | None:
     return f"{len(parts)} ({each}); the place and scale of all but the first are guessed"
 
 
+def after_gaps(posed_ids: Iterable[int], unposed_ids: Iterable[int]) -> frozenset[int]:
+    """Return the posed frames before which others were tracked that have no pose: no line leads to them.
+
+    Args:
+        posed_ids: Frames that have a pose in the end.
+        unposed_ids: Frames that had none when they were tracked.
+    """
+    posed = np.sort(np.fromiter(posed_ids, np.int64))
+    unposed = np.setdiff1d(np.fromiter(unposed_ids, np.int64), posed)
+    places = np.searchsorted(posed, unposed)
+    return frozenset(posed[places[(places > 0) & (places < len(posed))]].tolist())
+
+
 def select_part(data: RunData, part: str) -> RunData:
     """Return one part of a run, where it is in the world.
 

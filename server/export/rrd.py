@@ -1,5 +1,7 @@
 """A Rerun recording of a finished run: the one the server wrote, or one made from poses, images and map."""
 
+import contextlib
+import json
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,8 +11,9 @@ import numpy as np
 from semcast.common.errors import SemcastError, SourceError
 from semcast.common.image_file import read_image
 from semcast.common.message_fields import sendable
-from semcast.common.run_folder import VIEWER_NAME, RunData
+from semcast.common.run_folder import FRAMES_NAME, VIEWER_NAME, RunData
 from semcast.common.whole_file import whole_file
+from semcast.server.export.parts import after_gaps
 from semcast.server.view.frame_view import FrameView
 from semcast.server.view.picture import compress_picture
 from semcast.server.view.rerun_viewer import Delivery, RerunStream
@@ -45,6 +48,7 @@ def write_rrd(
         with recorded.open("rb") as source, whole_file(path) as copied:
             shutil.copyfileobj(source, copied)
         return [path]
+    begins_line = after_gaps(data.frame_ids.tolist(), _unposed(folder / FRAMES_NAME))
     # Rerun opens files by name: this one keeps the name until what is written is whole.
     with whole_file(path) as file:
         try:
@@ -58,7 +62,7 @@ def write_rrd(
         except (RuntimeError, UnicodeEncodeError) as err:  # a name may be no text
             raise SemcastError(f"{path} can't be written: {err}") from err
         try:
-            _show(stream, data, images)
+            _show(stream, data, images, begins_line)
             # Rerun writes on a thread of its own, and says only here that it could not, as on a full disk.
             delivery = stream.flush(CLOSE_DEADLINE_S)
         finally:
@@ -68,7 +72,19 @@ def write_rrd(
     return [path]
 
 
-def _show(stream: RerunStream, data: RunData, images: Mapping[int, Path]) -> None:
+def _unposed(path: Path) -> list[int]:
+    """Return the frames that had no pose when they were tracked, as far as the rows of a run tell."""
+    posed: dict[int, bool] = {}
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.is_file() else ():
+        with contextlib.suppress(ValueError, TypeError, KeyError):  # half a line, of a run that was killed
+            row = json.loads(line)
+            posed[int(row["frame_id"])] = bool(row["posed"])
+    return [frame_id for frame_id, has_pose in posed.items() if not has_pose]
+
+
+def _show(
+    stream: RerunStream, data: RunData, images: Mapping[int, Path], begins_line: frozenset[int]
+) -> None:
     """Send points, poses and images, frame by frame."""
     scene, cursor = Scene(), Cursor()
     # By how far landmarks are from where the camera begins, a scene knows how large it is.
@@ -78,7 +94,7 @@ def _show(stream: RerunStream, data: RunData, images: Mapping[int, Path]) -> Non
     for frame_id, t_ns, T_world_cam, is_first in zip(
         data.frame_ids.tolist(), data.t_source_ns.tolist(), data.T_world_cam, begins_part, strict=True
     ):
-        if is_first:
+        if is_first or frame_id in begins_line:
             scene.interrupt_path()
         view = _view(data, frame_id, t_ns, T_world_cam, images.get(frame_id))
         scene.add_frame(view)

@@ -28,6 +28,7 @@ class FrameView:
         keypoints_xy: ``(N, 2)`` pixels.
         keypoint_inlier: ``(N,)`` bool.
         backfilled: Poses found later for earlier frames: ``(frame_id, t_source_ns, T_world_cam)``.
+        after_gaps: Those of them before which the camera was lost.
     """
 
     frame_id: int
@@ -40,6 +41,7 @@ class FrameView:
     keypoints_xy: NDArray[np.float32]
     keypoint_inlier: NDArray[np.bool_]
     backfilled: Sequence[tuple[int, int, Array]] = ()
+    after_gaps: frozenset[int] = frozenset()
 
     def without_image(self) -> "FrameView":
         """Return the light part: pose and plot values, all of which come into the scene."""

@@ -168,6 +168,8 @@ class Scene:
         )
         self._num_rows += 1
         for frame_id, t_source_ns, T_world_cam in view.backfilled:
+            if frame_id in view.after_gaps:
+                self.interrupt_path()
             self._insert_pose(frame_id, t_source_ns, T_world_cam)
         if view.T_world_cam is None:
             if view.state != MISSING:

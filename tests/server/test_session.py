@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from drawn_markers import draw_marker
+from rows_of_runs import frame_row
 
 from semcast.common.camera import Intrinsics
 from semcast.common.config import build_settings, read_toml
@@ -18,7 +19,7 @@ from semcast.common.image_file import read_image
 from semcast.common.run_folder import FRAMES_NAME, read_image_paths, read_run
 from semcast.common.sequence import open_sequence
 from semcast.server.decoder import Arrival
-from semcast.server.frame_rows import read_rows
+from semcast.server.frame_rows import FrameRows, read_rows
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import DecodedFrame
 from semcast.server.marker_settings import MarkerSettings
@@ -438,24 +439,25 @@ def test_a_resumed_session_knows_the_metre_until_its_map_is_reset(demo, tmp_path
         assert session.metres.summary() == []
 
 
-def test_a_reset_after_a_resume_shows_nothing_of_the_map_before(demo, tmp_path):
-    run_session(demo, tmp_path, range(8), killed=True)
-    identity = StreamIdentity(
-        agent_id="a", agent_epoch=5, codec="x", digest="", camera=demo.intrinsics, num_frames=None
-    )
+def test_a_resume_shows_the_map_before_with_a_gap_where_it_was_lost_and_a_reset_nothing_of_it(demo, tmp_path):
+    run_session(demo, tmp_path, [*range(8), 9], killed=True)
+    with contextlib.closing(FrameRows(tmp_path, resume=True)) as rows:
+        rows.add(frame_row(8, posed=False))
     shown = []
     for is_reset in (False, True):
-        session = Session(ServerSettings(bundle="inline", out=tmp_path), identity, tmp_path, None)
+        out = ServerSettings(bundle="inline", out=tmp_path)
+        session = Session(out, replace(IDENTITY, camera=demo.intrinsics), tmp_path, None)
         assert session.resumed
         if is_reset:
             session.restart_map()
         now_ns = time.perf_counter_ns()
-        frame = DecodedFrame(8, int(demo.times_ns[8]), demo.image(8), None)
-        outcome = session.process(frame, Arrival(None, None, now_ns, now_ns, {}, {}))
-        shown.append(len(outcome.view.backfilled))
+        frame = DecodedFrame(10, int(demo.times_ns[10]), demo.image(10), None)
+        view = session.process(frame, Arrival(None, None, now_ns, now_ns, {}, {})).view
+        shown.append([(k, k in view.after_gaps) for k, *_ in view.backfilled])
         session.close()
-    assert shown[0] >= 5
-    assert shown[1] == 0
+    assert len(shown[0]) >= 6
+    assert [k for k, is_after_gap in shown[0] if is_after_gap] == [9]
+    assert shown[1] == []
 
 
 def test_a_file_that_can_not_be_written_costs_no_other(demo, tmp_path, read_ply):

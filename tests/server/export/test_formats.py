@@ -11,6 +11,7 @@ import pytest
 import trimesh
 from evo.tools import file_interface
 from full_disk import room_for
+from rows_of_runs import frame_row
 
 from semcast import SemcastError, SourceError
 from semcast.cli import main
@@ -22,6 +23,7 @@ from semcast.server.export.formats import FORMATS, export_run
 from semcast.server.export.geometry import landmark_rows, reprojection_errors_px
 from semcast.server.export.nerfstudio import write_nerfstudio
 from semcast.server.export.poses import write_run_kitti, write_run_tum
+from semcast.server.frame_rows import FrameRows
 
 
 def written(tmp_path, data, write_arc_run, keep="keyframes"):
@@ -350,6 +352,23 @@ def test_a_rerun_recording_that_is_made_is_exact_in_time_and_has_a_line_for_each
         assert [t.value for t in at[entity, "source_time"]] == times_ns.tolist(), entity
     lines = at["/world/trajectory/0000", "LineStrips3D:strips"][-1]
     assert [len(line) for line in lines] == [4, len(times_ns) - 4]
+
+
+def test_a_rerun_recording_that_is_made_draws_no_line_through_frames_without_a_pose(
+    tmp_path, arc_run, write_arc_run
+):
+    data = arc_run()
+    write_arc_run(tmp_path / "run", data)
+    posed = data.frame_ids.tolist()
+    record = FrameRows(tmp_path / "run")
+    for frame_id in range(posed[-1] + 1):
+        record.add(frame_row(frame_id, posed=frame_id in posed))
+    record.close()
+    with (tmp_path / "run" / "frames.jsonl").open("a") as file:
+        file.write('{"frame_id": 5, "po')
+    export_run(tmp_path / "run", "rrd", tmp_path / "made.rrd")
+    lines = read_rrd(tmp_path / "made.rrd")["/world/trajectory/0000", "LineStrips3D:strips"][-1]
+    assert [len(line) for line in lines] == [4, len(posed) - 4]
 
 
 @pytest.mark.parametrize("room", [0, 3000])

@@ -12,7 +12,7 @@ from semcast.commands.demo import summary_table
 from semcast.common.run_folder import VIEWER_NAME, read_run
 from semcast.server.export import formats
 from semcast.server.export.formats import export_run
-from semcast.server.export.parts import count_parts, parts_line, select_part
+from semcast.server.export.parts import after_gaps, count_parts, parts_line, select_part
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 
@@ -148,3 +148,9 @@ def test_the_table_of_a_run_names_its_parts_only_where_there_are_several():
             text for column in summary_table({"parts": count_parts(parts)}).columns for text in column.cells
         ]
         assert [text.split(";")[0] for text in cells if "(part 0" in text] == told
+
+
+def test_a_line_is_broken_where_frames_were_tracked_that_have_no_pose_in_the_end():
+    posed = {1, 2, 3, 6, 7, 8, 9, 11, 13}  # 1 and 8 later than when they were tracked
+    assert after_gaps(posed, [0, 1, 4, 5, 8, 10, 15]) == {6, 11}
+    assert after_gaps([], [1, 2]) == after_gaps(posed, []) == frozenset()

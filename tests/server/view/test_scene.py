@@ -110,6 +110,14 @@ def test_frames_posed_later_take_their_place_in_the_line():
     assert scene.poses()[:, 0, 3].tolist() == [0.0, 1.0, 2.0]
 
 
+def test_the_line_of_frames_that_come_together_is_cut_where_the_camera_was_lost():
+    scene = Scene()
+    together = view(9, at(9), backfilled=tuple((k, k, at(k)) for k in (0, 1, 2, 5, 6)))
+    scene.add_frame(replace(together, after_gaps=frozenset({5})))
+    lines = scene.changes_since(Cursor()).segments[0]
+    assert [line[:, 0].tolist() for line in lines] == [[0.0, 1.0, 2.0], [5.0, 6.0, 9.0]]
+
+
 def test_earlier_frames_that_became_keyframes_of_a_start_move_by_themselves():
     scene = Scene()
     scene.add_frame(view(0))
