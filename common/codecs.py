@@ -1,6 +1,7 @@
 """All codecs by name, learned and conventional: the one way to get a codec."""
 
 import logging
+from collections.abc import Collection, Sequence
 from functools import cache
 from importlib import resources
 from importlib.util import find_spec
@@ -50,6 +51,23 @@ def available_codecs() -> list[str]:
 def is_conventional(codec: str) -> bool:
     """Tell whether a codec of this name is made of an image format and a channel code."""
     return codec in _conventional_names()
+
+
+def is_adaptive(codec: str) -> bool:
+    """Tell whether a codec of this name chooses its modulation itself, by the SNR."""
+    return is_conventional(codec) and _conventional_names()[codec][1]
+
+
+def warn_of_modulation(codec: str | Sequence[str], given: Collection[str]) -> None:
+    """Say that a modulation does nothing that was asked for.
+
+    Args:
+        codec: Name, or names: on one that is not adaptive it has an effect.
+        given: Names of the settings that somebody gave.
+    """
+    names = [codec] if isinstance(codec, str) else list(codec)
+    if "modulation" in given and names and all(map(is_adaptive, names)):
+        logger.warning("modulation: no effect on codec %s, which chooses its own", ", ".join(names))
 
 
 def _choose_runtime(runtime: Runtime, weights: Path | None) -> Literal["torch", "onnx"]:

@@ -144,6 +144,34 @@ def test_every_setting_reaches_a_process(tmp_path):
     assert tuple(words[words.index(f"--{name}-port") + 1] for name in ("viewer", "web")) == ("9877", "9091")
 
 
+def test_a_codec_that_chooses_its_modulation_is_given_none(tmp_path):
+    commands = commands_of(DemoSettings(codec="jpeg-amc", out=tmp_path))
+    assert not any("--modulation" in command for command in commands.values())
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["demo", "--sequence", "missing"],
+        ["agent", "--source", "missing"],
+        ["server", "--out", "file/out"],
+        ["eval", "trajectory", "--sequence", "missing"],
+        ["eval", "codec", "--images", "missing"],
+    ],
+)
+def test_a_modulation_that_is_asked_of_such_a_codec_is_told_to_do_nothing(
+    words, tmp_path, monkeypatch, caplog
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("")
+    for given, told in (([], []), (["--modulation", "16qam"], ["modulation: no effect on codec jpeg-amc"])):
+        caplog.clear()
+        assert main([*words, "--codec", "jpeg-amc", *given]) == 1
+        assert [
+            r.getMessage().partition(",")[0] for r in caplog.records if "effect" in r.getMessage()
+        ] == told
+
+
 def test_the_camera_reaches_the_agent_and_the_reference_it_is_compared_with(tmp_path):
     def commands(**camera):
         settings = DemoSettings(camera=CameraSettings(**camera), out=tmp_path)

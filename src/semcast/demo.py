@@ -15,7 +15,7 @@ from semcast.channel.link import Link
 from semcast.channel.settings import ChannelSettings
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.codec import DEFAULT_CODEC, MODULATION_HELP, Modulation
-from semcast.common.codecs import check_codec, is_conventional, named_weights
+from semcast.common.codecs import check_codec, is_adaptive, is_conventional, named_weights
 from semcast.common.config import to_toml
 from semcast.common.config_flags import flag_words
 from semcast.common.errors import ConfigError, SemcastError, TransportError
@@ -161,7 +161,7 @@ def role_commands(settings: DemoSettings, reference: Path | None, endpoint: str)
         server += ["--reference", str(reference), *flag_words(settings.camera)]
     server += ["--confidence", settings.confidence]
     server += flag_words(settings.view_settings, ("view",))
-    server += ["--seed", str(settings.seed), "--codec", settings.codec, "--modulation", settings.modulation]
+    server += ["--seed", str(settings.seed), *_codec_words(settings)]
     server += ["--save-images", settings.save_images]
     server += ["--dense-cloud", settings.dense_cloud]
     if settings.record is not None:
@@ -171,11 +171,17 @@ def role_commands(settings: DemoSettings, reference: Path | None, endpoint: str)
     return {"server": server, "channel": channel}
 
 
+def _codec_words(settings: DemoSettings) -> list[str]:
+    """Return codec and modulation, which does nothing with a codec that chooses its own."""
+    modulation = [] if is_adaptive(settings.codec) else ["--modulation", settings.modulation]
+    return ["--codec", settings.codec, *modulation]
+
+
 def agent_command(settings: DemoSettings, sequence: Path, endpoint: str, playback: Playback) -> list[str]:
     """Return the command line of the agent, which is started last."""
     agent = [*_PROGRAM, "agent", "--agent-id", AGENT_ID, "--connect", endpoint]
     agent += ["--source", str(sequence), *flag_words(settings.camera)]
-    agent += ["--codec", settings.codec, "--modulation", settings.modulation, "--rate", settings.rate]
+    agent += [*_codec_words(settings), "--rate", settings.rate]
     agent += ["--resize", f"{playback.resize:g}", "--stride", str(playback.stride)]
     if playback.speed != 1.0:
         agent += ["--pace", "rate", "--rate-hz", f"{playback.rate_hz:.3g}"]

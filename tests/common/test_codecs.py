@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from semcast.cli import main
-from semcast.common.codecs import check_codec, codec_of_weights, load_codec, named_weights
+from semcast.common.codecs import check_codec, codec_of_weights, load_codec, named_weights, warn_of_modulation
 from semcast.common.errors import CheckpointError, ConfigError
 from semcast.training.onnx_export import export_encoder
 
@@ -104,6 +104,19 @@ def test_what_is_asked_of_a_network_is_told_to_have_no_effect_on_a_conventional_
     load_codec("jpeg-amc", precision="float32", device="cuda", runtime="onnx")
     told = ["device, runtime, precision: no effect on codec jpeg-amc, which has no network"]
     assert [record.getMessage() for record in caplog.records] == told
+
+
+def test_a_modulation_that_was_asked_for_is_told_to_do_nothing_where_codecs_choose_theirs(caplog):
+    warn_of_modulation("jpeg-amc", {"snr_db"})
+    for codec in ("jpeg-ldpc", "3dcsc-lite", (), ("jpeg-amc", "jpeg-ldpc")):
+        warn_of_modulation(codec, {"modulation"})
+    assert not caplog.records
+    warn_of_modulation("jpeg-amc", {"modulation"})
+    warn_of_modulation(("jpeg-amc", "webp-amc"), {"modulation": "16qam"})
+    assert [record.getMessage() for record in caplog.records] == [
+        f"modulation: no effect on codec {names}, which chooses its own"
+        for names in ("jpeg-amc", "jpeg-amc, webp-amc")
+    ]
 
 
 @pytest.mark.parametrize("runtime", ["auto", "onnx"])

@@ -6,7 +6,7 @@ from dataclasses import replace
 from semcast.agent.agent import run_agent
 from semcast.agent.settings import AgentSettings
 from semcast.commands.running import add_settings, read_given, read_settings, run_until_stopped
-from semcast.common.codecs import codec_of_weights
+from semcast.common.codecs import codec_of_weights, warn_of_modulation
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -29,4 +29,5 @@ def settings_of(arguments: argparse.Namespace) -> AgentSettings:
 def run(arguments: argparse.Namespace) -> int:
     """Send until the source ends or the process is stopped."""
     settings = settings_of(arguments)
+    warn_of_modulation(settings.codec, read_given(AgentSettings, arguments))
     return run_until_stopped(lambda stop: run_agent(settings, stop))

@@ -15,6 +15,7 @@ from semcast.channel.emulator import warn_of_settings
 from semcast.channel.settings import ChannelSettings
 from semcast.commands.console import plain_console
 from semcast.commands.running import INTERRUPTED, add_settings, read_settings, run_until_stopped
+from semcast.common.codecs import warn_of_modulation
 from semcast.common.config_flags import given_values
 from semcast.common.metrics import DUPLICATE
 from semcast.common.run_folder import FRAMES_NAME, VIEWER_NAME, files_of_run
@@ -107,6 +108,7 @@ def run(arguments: argparse.Namespace) -> int:
     """
     settings = read_settings(DemoSettings, arguments)
     warn_of_settings(settings.link, _asked_of_link(settings, arguments))
+    warn_of_modulation(settings.codec, given_values(DemoSettings, arguments))
     json_to_stdout = settings.json == STDOUT
     if json_to_stdout:
         settings = replace(settings, json=None)

@@ -18,6 +18,7 @@ from semcast.channel.emulator import warn_of_settings
 from semcast.channel.link import Link
 from semcast.commands.console import plain_console
 from semcast.commands.running import INTERRUPTED, add_settings, read_given, read_settings
+from semcast.common.codecs import warn_of_modulation
 from semcast.evaluation import (
     codec,
     confidence,
@@ -155,7 +156,9 @@ def run(arguments: argparse.Namespace) -> int:
     elif settings.json is None and out is not None:
         settings = replace(settings, json=out / RESULT_NAME)
     check_outputs(settings.json, out)
-    _check_link(settings, read_given(cls, arguments))
+    given = read_given(cls, arguments)
+    _check_link(settings, given)
+    warn_of_modulation(getattr(settings, "codec", None) or (), given)
     if settings.json is None and not json_to_stdout and _input_exists(settings):
         _tell("only the table will be left of this run: --json FILE keeps all figures")
     before_ns = _write_times_ns(out)

@@ -2,7 +2,8 @@
 
 import argparse
 
-from semcast.commands.running import add_settings, read_settings, run_until_stopped
+from semcast.commands.running import add_settings, read_given, read_settings, run_until_stopped
+from semcast.common.codecs import warn_of_modulation
 from semcast.server.server import run_server
 from semcast.server.settings import ServerSettings
 
@@ -15,6 +16,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Serve until the source ends or the process is stopped; outputs are always written."""
     settings = read_settings(ServerSettings, arguments)
+    warn_of_modulation(settings.codec or (), read_given(ServerSettings, arguments))
     if settings.device == "cuda" or settings.precision not in ("auto", "float32"):
         # Without --codec the decoder is loaded when the first frame arrives: too late to say this.
         from semcast.common.nets.codec import torch_device
