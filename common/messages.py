@@ -436,7 +436,8 @@ class StatusMessage(_Versioned):
         counts: Events since the start, by name.
         drops: Frames dropped since the start, by reason.
         stages_ms: Stage to (p50, p95, max) over the last frames.
-        last_error: One line, empty when there was none.
+        last_error: One line on what last went wrong, also where that is no more than a warning in the log;
+            empty when nothing did. ``counts["errors"]`` is how often.
         activity: What it is at besides frames, in a few words; empty when it is at nothing else. Of an agent
             whose rate follows the link: how many channel uses a frame takes now.
         ended: Of an agent: its source came to its end, and ``counts["sent"]`` frames are all there are.

@@ -97,7 +97,7 @@ class Metrics:
             self.observe(name, (self._clock_ns() - started_ns) * 1e-6)
 
     def error(self, text: str) -> None:
-        """Remember one line as the last error."""
+        """Remember one line on what went wrong, be it an error or only warned of, as the last error."""
         with self._lock:
             self._last_error = sendable(text, 1000)
             self._counts["errors"] = self._counts.get("errors", 0) + 1
