@@ -181,8 +181,7 @@ class MapBuilder:
         self._bound()
         self._submit(start=True)
         self.collect(wait=True)
-        visible = tracks.ids[tracks.visible]
-        self.num_inliers_at_keyframe = int((self.world.landmarks.rows(visible) >= 0).sum())
+        self._count_inliers(tracks.ids[tracks.visible])
 
     def anchor(self, tracks: TrackTable, sight: Sight, T_world_cam: Array) -> int:
         """Align tracks with how earlier keyframes of this submap saw them; the number aligned."""
@@ -343,7 +342,7 @@ class MapBuilder:
             )
         )
         self._add_landmarks(frame.image)
-        self.num_inliers_at_keyframe = int((world.landmarks.rows(ids) >= 0).sum())
+        self._count_inliers(ids)
         self._bound()
         self._submit()
 
@@ -362,6 +361,10 @@ class MapBuilder:
     def enough(self) -> int:
         """Number of landmarks with which a keyframe has enough."""
         return round(_ENOUGH_SHARE * self._settings.max_features)
+
+    def _count_inliers(self, ids: NDArray[np.int64]) -> None:
+        """Take how many of the tracks of the newest keyframe have a landmark."""
+        self.num_inliers_at_keyframe = int((self.world.landmarks.rows(ids) >= 0).sum())
 
     def _add_landmarks(self, image: NDArray[np.uint8]) -> None:
         parallax_deg, noise = self._settings.min_parallax_deg, self.noise.model
@@ -420,7 +423,7 @@ class MapBuilder:
             self._add_landmarks(image)
             self._submit()
             self.collect(wait=True)
-            self.num_inliers_at_keyframe = int((self.world.landmarks.rows(moved[-1].ids) >= 0).sum())
+            self._count_inliers(moved[-1].ids)
         return moved
 
     def adjust_whole(self) -> int:
