@@ -172,6 +172,9 @@ def test_set_is_checked_against_the_running_channel(channel, tmp_path, capsys):
     assert main([*words, "--config", str(file), "--slot-loss", "0.5"]) == 0
     now = json.loads(capsys.readouterr().out)
     assert (now["snr_db"], now["slot_loss"], now["burst_slots"]) == (3.0, 0.5, 20.0)
+    file.write_text("snr_db = 99\n")
+    assert main([*words, "--config", str(file), "--slot-loss", "0.5"]) == 1
+    assert f": {file}: snr_db must be in [-5, 30], got 99" in capsys.readouterr().err
 
 
 def test_what_does_nothing_is_said(channel, capsys, caplog):

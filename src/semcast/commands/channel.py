@@ -10,6 +10,7 @@ from semcast.channel.emulator_settings import EmulatorSettings
 from semcast.channel.settings import ChannelSettings
 from semcast.commands.running import add_settings, read_given, read_settings, run_until_stopped
 from semcast.common.config import build_settings
+from semcast.common.config_flags import given_values
 from semcast.common.errors import ConfigError
 
 logger = logging.getLogger(__name__)
@@ -46,7 +47,13 @@ def _set(arguments: argparse.Namespace) -> int:
     settings = build_settings(EmulatorSettings, given)
     if "trace_file" in changes:  # the running channel has another working folder
         changes["trace_file"] = str(Path(changes["trace_file"]).absolute())
-    in_force = set_channel(settings.network, settings.agent_id, changes)
+    try:
+        in_force = set_channel(settings.network, settings.agent_id, changes)
+    except ConfigError as err:
+        typed = given_values(EmulatorSettings, arguments).get("link", {})
+        if str(err).partition(" ")[0] not in changes.keys() - typed.keys():
+            raise
+        raise ConfigError(f"{arguments.config}: {err}") from err
     warn_of_settings(build_settings(ChannelSettings, in_force), changes)
     print(json.dumps(in_force, indent=1))
     return 0
