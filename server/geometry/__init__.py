@@ -34,6 +34,7 @@ Pose and structure
     motion           constant-velocity prior
     bunches          frames that come in bunches, and whether their times mislead
     gap_bridge       how the camera got across a gap, and how far off that is
+    jump             whether a camera that went steadily jumped
     whereabouts      where the camera can have got to in a gap
 
 Numbers

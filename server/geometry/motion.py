@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from semcast.common.geometry import exp_so3, invert_transform, log_so3, make_transform
 from semcast.server.geometry.gap_bridge import cross_gap, even_turns, hindcast, way_of
+from semcast.server.geometry.jump import is_jump
 from semcast.server.geometry.whereabouts import SAME_S, Step, Whereabouts, last_by, mean_way
 
 Array = NDArray[np.float64]
@@ -144,6 +145,16 @@ class ConstantVelocity:
     def turn_in(self, elapsed_s: float) -> Array:
         """Rotation ``R_now_then (3, 3)`` of a camera that goes on turning as it did for so long."""
         return exp_so3(elapsed_s * self._turn_per_s())
+
+    def jumps_to(self, t_source_ns: int, T_world_cam: Array) -> bool:
+        """Tell whether a pose at a time is a jump of a camera that went steadily, see ``is_jump``."""
+        if self._last is None:
+            return False
+        t_ns, T_world_last = self._last
+        elapsed_s = (t_source_ns - t_ns) * 1e-9
+        return elapsed_s > 0.0 and is_jump(
+            self._steps, elapsed_s, invert_transform(T_world_last) @ T_world_cam
+        )
 
     def whereabouts(self, t_source_ns: int, depth: float) -> Whereabouts | None:
         """Where the camera can be at a time, with the scene at a depth in map units.

@@ -143,6 +143,10 @@ class CameraMotion:
         """As ``ConstantVelocity.whereabouts``; None while the camera stands, or seems to."""
         return None if self._still else self._motion.whereabouts(t_source_ns, depth)
 
+    def jumps_to(self, t_source_ns: int, T_world_cam: Array) -> bool:
+        """As ``ConstantVelocity.jumps_to``; nowhere where times mislead, or while the camera stands."""
+        return not (self._still or self._bunches.mislead) and self._motion.jumps_to(t_source_ns, T_world_cam)
+
     def way_in(self, elapsed_s: float) -> Array:
         """Translation ``(3,)`` in the camera's frame that goes on for so long; none while it stands."""
         return np.zeros(3) if self._still else self._motion.way_in(elapsed_s)

@@ -1,5 +1,6 @@
 """Where the camera of a frame is in the map: by its tracks, and by landmarks that are looked for again."""
 
+import logging
 from functools import partial
 
 import numpy as np
@@ -20,6 +21,8 @@ from semcast.server.mapping.tracker import (
     track_pose,
 )
 from semcast.server.mapping.tracks import TrackTable
+
+logger = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
@@ -148,7 +151,20 @@ class Locator:
         if pose is not None and is_vague and not self._resembles(sight, pose):
             self._tracks.clear()  # nothing that was found is kept
             return None
+        if pose is not None and is_vague and self._makes_jump(sight, pose):
+            # Not all of them are wrong, but which ones nobody knows; other tracks serve to begin anew.
+            self._tracks.keep(self._map.world.landmarks.rows(self._tracks.ids) < 0)
+            return None
         return pose
+
+    def _makes_jump(self, sight: Sight, pose: TrackedPose) -> bool:
+        """Tell whether a vague pose makes a camera that went steadily jump: then it is wrong."""
+        frame = sight.frame
+        if self._is_after_gap or not self._motion.jumps_to(frame.t_source_ns, pose.T_world_cam):
+            return False
+        seen = f"{pose.num_inliers} of {len(pose.ids)} landmarks"
+        logger.debug("frame %d: %s make the camera jump, which they are too few for", frame.frame_id, seen)
+        return True
 
     def _possible(self, pose: TrackedPose | None) -> TrackedPose | None:
         """Give up a pose that the camera can't have got to in a gap."""
