@@ -10,6 +10,12 @@ PIP_INSTALL := $(BIN)/python -m pip install --quiet --no-compile --disable-pip-v
 # Tests start hundreds of processes; each would compile all modules anew.
 unexport PYTHONDONTWRITEBYTECODE
 
+# Tests and benchmarks are no verbs, which see to this by themselves: where other work keeps the cores busy,
+# threads of numpy that share a product wait for each other all the time.
+OPENBLAS_NUM_THREADS ?= 1
+OMP_WAIT_POLICY ?= PASSIVE
+export OPENBLAS_NUM_THREADS OMP_WAIT_POLICY
+
 .PHONY: demo test test-slow check format docs results-page bench-pairs bench-scenes bench-loss \
   bench-lost-detail clean help
 
