@@ -31,14 +31,26 @@ def walked(steps):
     return make_transform(np.eye(3), (0.001 * np.sin(2.0 * steps), 0.0, 0.04 * steps))
 
 
+class EverythingResembles(MapBuilder):
+    """A map without images to compare with."""
+
+    def resembles(self, *_):
+        return True
+
+
+def in_map_of(xyz):
+    """Locator in a map of landmarks, its tracks and its motion."""
+    num = len(xyz)
+    builder = EverythingResembles(CAMERA, SETTINGS, InlineBundle(), lambda _: None)
+    builder.world.add_landmarks(np.arange(num), xyz, np.zeros((num, 3), np.uint8), np.ones(num), 0, 0)
+    motion, tracks = CameraMotion(CAMERA), TrackTable(SETTINGS.confidence, SETTINGS.max_features, seed=0)
+    return Locator(CAMERA, SETTINGS, builder, tracks, motion), tracks, motion
+
+
 def located(num, *, is_proved, off_px=OFF_PX):
     """Pose at a place where so many landmarks are off, each in another direction."""
-    rng = np.random.default_rng(0)
-    builder = MapBuilder(CAMERA, SETTINGS, InlineBundle(), lambda _: None)
-    motion, tracks = CameraMotion(CAMERA), TrackTable(SETTINGS.confidence, SETTINGS.max_features, seed=0)
-    locator = Locator(CAMERA, SETTINGS, builder, tracks, motion)
-    ids, xyz = np.arange(num), rng.uniform((-2, -1.5, 4), (2, 1.5, 8), (num, 3))
-    builder.world.add_landmarks(ids, xyz, np.zeros((num, 3), np.uint8), np.ones(num), 0, 0)
+    ids, xyz = np.arange(num), np.random.default_rng(0).uniform((-2, -1.5, 4), (2, 1.5, 8), (num, 3))
+    locator, _, _ = in_map_of(xyz)
     angle = 2.4 * np.arange(num)
     xy = CAMERA.project(xyz) + off_px * np.column_stack([np.cos(angle), np.sin(angle)])
     sigma = np.full(num, PATCH_SIGMA_PX)
@@ -64,25 +76,15 @@ def test_a_place_whose_landmarks_are_where_the_map_has_them_needs_no_proof():
     assert located(17, is_proved=False, off_px=0.3).num_inliers == 17
 
 
-class EverythingResembles(MapBuilder):
-    """A map without images to compare with."""
-
-    def resembles(self, *_):
-        return True
-
-
 def tracked_after_a_walk(num, ahead):
     """Pose of a frame that sees so many landmarks from so many steps ahead of a camera that walked."""
     rng = np.random.default_rng(0)
-    builder = EverythingResembles(CAMERA, SETTINGS, InlineBundle(), lambda _: None)
-    motion, tracks = CameraMotion(CAMERA), TrackTable(SETTINGS.confidence, SETTINGS.max_features, seed=0)
-    locator = Locator(CAMERA, SETTINGS, builder, tracks, motion)
-    ids, xyz = np.arange(num), rng.uniform((-2, -1.5, 8), (2, 1.5, 12), (num, 3))
-    builder.world.add_landmarks(ids, xyz, np.zeros((num, 3), np.uint8), np.ones(num), 0, 0)
+    xyz = rng.uniform((-2, -1.5, 8), (2, 1.5, 12), (num, 3))
+    locator, tracks, motion = in_map_of(xyz)
     for k in range(30):
         motion.observe(k, k * FRAME_NS, walked(k), xyz)
     xy = CAMERA.project(transform_points(invert_transform(walked(29 + ahead)), xyz))
-    tracks.adopt(ids, xy, 1.0)
+    tracks.adopt(np.arange(num), xy, 1.0)
     image = rng.integers(0, 255, (480, 640), np.uint8)
     frame = DecodedFrame(30, 30 * FRAME_NS, np.repeat(image[..., None], 3, axis=2))
     sight = Sight(frame, image, np.ones(480, bool))
