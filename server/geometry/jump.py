@@ -14,7 +14,7 @@ from semcast.server.geometry.whereabouts import Step
 Array = NDArray[np.float64]
 
 #: A step is a jump where it is further from the one before than so many times what is usual, and than this
-#: share of a step. In front of bare walls, poses off by less were as good as others.
+#: share of a step. At a corridor's bare corner, 3.5 and 0.3 refuse one more pose, and paths are no better.
 _TIMES_USUAL, _SHARE = 6.0, 0.4
 #: Steps that tell what is usual.
 _NUM_STEPS = 20
@@ -28,22 +28,21 @@ def is_jump(steps: Sequence[Step], elapsed_s: float, T_before_now: Array) -> boo
     """Tell whether a camera that went steadily would hardly go on by this step.
 
     Args:
-        steps: Its last ones, oldest first.
-        elapsed_s: Time of the new one, more than 0.
-        T_before_now: ``(4, 4)`` the new one.
+        steps: Its last ones, oldest first, map units.
+        elapsed_s: Seconds that the new one took, more than 0.
+        T_before_now: ``(4, 4)`` the new one, from the camera's frame now to that before.
 
     Returns:
         False also where too few are known, and where the camera did not go steadily.
     """
     if len(steps) < _NUM_STEPS:
         return False
-    took_s = np.array([step_s for step_s, _, _ in steps[-_NUM_STEPS:]])
-    ways = np.array([way for _, _, way in steps[-_NUM_STEPS:]])
-    way, lengths = np.linalg.norm(ways.sum(axis=0)), np.linalg.norm(ways, axis=1)
+    took_s, moves, ways = zip(*steps[-_NUM_STEPS:], strict=True)
+    way, lengths = np.linalg.norm(np.sum(ways, axis=0)), np.linalg.norm(ways, axis=1)
     is_steady = way > _STEADY_SHARE * lengths.sum()  # which a camera at rest is not: it may set off
     if not is_steady or elapsed_s > _INTERVALS * np.median(took_s):
         return False
-    went = np.array([T[:3, 3] for _, T, _ in steps[-_NUM_STEPS:]])
-    usual = np.median(np.linalg.norm(went[1:] - went[:-1] * (took_s[1:] / took_s[:-1])[:, None], axis=1))
-    off = np.linalg.norm(T_before_now[:3, 3] - went[-1] * elapsed_s / took_s[-1])
-    return bool(off > max(_TIMES_USUAL * usual, _SHARE * lengths.mean()))
+    times_s = np.array([*took_s, elapsed_s])
+    went = np.array([T[:3, 3] for T in (*moves, T_before_now)])
+    off = np.linalg.norm(went[1:] - went[:-1] * (times_s[1:] / times_s[:-1])[:, None], axis=1)
+    return bool(off[-1] > max(_TIMES_USUAL * np.median(off[:-1]), _SHARE * lengths.mean()))

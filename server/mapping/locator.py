@@ -153,7 +153,7 @@ class Locator:
             return None
         if pose is not None and is_vague and self._makes_jump(sight, pose):
             # Not all of them are wrong, but which ones nobody knows; other tracks serve to begin anew.
-            self._tracks.keep(self._map.world.landmarks.rows(self._tracks.ids) < 0)
+            self._let_go_of_landmarks()
             return None
         return pose
 
@@ -200,5 +200,9 @@ class Locator:
         pose = self._with_more(sight, None, T_world_rest)
         if pose is None or (pose.num_inliers >= _LEAST_UNHIDDEN and self._resembles(sight, pose)):
             return pose
-        self._tracks.keep(self._map.world.landmarks.rows(self._tracks.ids) < 0)
+        self._let_go_of_landmarks()
         return None
+
+    def _let_go_of_landmarks(self) -> None:
+        """Follow no track of a landmark any more."""
+        self._tracks.keep(self._map.world.landmarks.rows(self._tracks.ids) < 0)
