@@ -51,7 +51,7 @@ bench-pairs: $(VENV)/.ready-run  ## measure relative poses (DATA=folder with seq
 	$(BIN)/python -m semcast.evaluation.pair_suite $(DATA) $(ARGS)
 	$(BIN)/python -m semcast.evaluation.results_page
 
-bench-scenes: $(VENV)/.ready-run  ## draw rooms, streets, blocks, orbits, measure paths on them (two hours of a core); overwrites results
+bench-scenes: $(VENV)/.ready-run  ## draw rooms, streets, blocks, orbits, measure paths on them (three hours of a core); overwrites results
 	$(BIN)/python -m semcast.evaluation.scene_suite $(ARGS)
 	$(BIN)/python -m semcast.evaluation.results_page
 

@@ -28,8 +28,8 @@ README_LINKS: dict[tuple[str, float] | None, str] = {
     ("erasure", 6.0): "one slot in five lost, 6 dB",
     ("awgn", 2.0): "noise, 2 dB",
 }
-
-
+#: A recording that was sent over this link alone has no row.
+_POOR_LINK = ("rayleigh", 2.0)
 #: Link of which the table also has the errors of poses as they were published, and the name of that column.
 _LIVE_LINK, _LIVE = ("rayleigh", 6.0), "the same, live"
 
@@ -121,7 +121,7 @@ def readme_table(folder: Path) -> str:
     """Return the README's short table: path errors in the default mode, recordings by links.
 
     Recordings that were sent over most links come first. Those with a gap, Doppler or another codec are not
-    in it.
+    in it, nor those that were sent over the poor link alone: they are there for what confidence is worth.
     """
     errors: dict[str, dict[str, str]] = {}
     live: dict[str, str] = {}
@@ -146,7 +146,8 @@ def readme_table(folder: Path) -> str:
                 if link == _LIVE_LINK and "ate_at_once_percent" in cell:
                     live[report["sequence"]] = median_and_worst(cell, "ate_at_once_percent")
     links = list(README_LINKS.values())
-    ordered = sorted(errors.items(), key=lambda entry: (-len(entry[1]), entry[0]))
+    shown = [(name, of) for name, of in errors.items() if set(of) != {README_LINKS[_POOR_LINK]}]
+    ordered = sorted(shown, key=lambda entry: (-len(entry[1]), entry[0]))
     for name, of in ordered:
         of[_LIVE] = live.get(name, "-")
     links.insert(links.index(README_LINKS[_LIVE_LINK]) + 1, _LIVE)

@@ -56,6 +56,15 @@ def test_other_codecs_and_links_are_not_in_it(tmp_path, other):
     assert "7.77" not in rows
 
 
+def test_a_recording_that_was_sent_over_the_poor_link_alone_is_not_in_it(tmp_path):
+    poor = report(DEFAULT_CODEC, 7.77)
+    (tmp_path / "trajectory_a.json").write_text(json.dumps(poor))
+    assert "7.77" in readme_table(tmp_path)
+    poor["cells"][0]["snr_db"] = 2.0
+    (tmp_path / "trajectory_a.json").write_text(json.dumps(poor))
+    assert "7.77" not in readme_table(tmp_path)
+
+
 def test_a_part_that_an_interrupted_run_left_is_not_in_it(tmp_path):
     (tmp_path / "trajectory_a.json").write_text(json.dumps(report(DEFAULT_CODEC, 0.25)))
     (tmp_path / "trajectory_b.partial.json").write_text(json.dumps(report(DEFAULT_CODEC, 7.77)))
