@@ -8,14 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.codec import DecodedImage
+from semcast.server.geometry.corners import corner_strength, deduplicate, detect_corners
 from semcast.server.geometry.edges import edges_at
-from semcast.server.geometry.features import (
-    corner_strength,
-    deduplicate,
-    detect_corners,
-    to_grey,
-    track_points,
-)
+from semcast.server.geometry.grey import to_grey
+from semcast.server.geometry.klt import track_points
 from semcast.server.geometry.sampling import sample_map
 from semcast.server.geometry.weighting import fuse_confidence
 

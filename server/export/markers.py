@@ -19,7 +19,7 @@ from semcast.common.geometry import align_umeyama, exp_so3, invert_transform
 from semcast.common.image_file import read_image
 from semcast.common.run_folder import RunData
 from semcast.server.export.placement import TWO_SIDED_95, Placement
-from semcast.server.geometry.features import to_grey
+from semcast.server.geometry.grey import to_grey
 from semcast.server.geometry.triangulation import triangulate
 
 Array = NDArray[np.float64]

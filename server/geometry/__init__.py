@@ -7,7 +7,10 @@ Observations and their noise
     edges            anisotropic errors: how much better a point is known across an edge than along it
 
 Points in images
-    features         corners, KLT, binary descriptors
+    grey             grey images
+    corners          corners to follow
+    klt              points followed from image to image (Lucas-Kanade)
+    descriptors      binary descriptors (ORB) and their matches
     warped_points    KLT in windows that are turned, scaled or sheared
     patch_alignment  patches of two images, aligned to a fraction of a pixel
     wide_search      matches by SIFT, however far points moved

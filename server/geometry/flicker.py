@@ -11,7 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semcast.server.geometry.features import Grey, TrackedPoints, track_alike
+from semcast.server.geometry.grey import Grey
+from semcast.server.geometry.klt import TrackedPoints, track_alike
 
 Array = NDArray[np.float64]
 

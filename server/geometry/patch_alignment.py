@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.codec import KLT_WINDOW_PX
-from semcast.server.geometry.features import Grey
+from semcast.server.geometry.grey import Grey
 from semcast.server.geometry.projection import MIN_DEPTH_MAP, projection_jacobian
 from semcast.server.geometry.sampling import bilinear
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3
-from semcast.server.geometry.features import Grey
+from semcast.server.geometry.grey import Grey
 from semcast.server.geometry.sampling import bilinear
 from semcast.server.geometry.weighting import MAD_TO_SIGMA
 

@@ -9,13 +9,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from semcast.server.geometry.features import (
-    MAX_FORWARD_BACKWARD_PX,
-    Grey,
-    TrackedPoints,
-    corner_strength,
-    track_points,
-)
+from semcast.server.geometry.corners import corner_strength
+from semcast.server.geometry.grey import Grey
+from semcast.server.geometry.klt import MAX_FORWARD_BACKWARD_PX, TrackedPoints, track_points
 from semcast.server.geometry.patch_alignment import ANCHOR_PATCH_PX, Templates, align_patches
 from semcast.server.geometry.sampling import sample_map
 

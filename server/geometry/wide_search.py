@@ -11,7 +11,7 @@ import numpy as np
 import poselib
 from numpy.typing import NDArray
 
-from semcast.server.geometry.features import Grey
+from semcast.server.geometry.grey import Grey
 from semcast.server.geometry.square_distance import square_distances
 
 Array = NDArray[np.float64]

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from semcast.server.geometry.features import Grey, TrackedPoints, track_alike
+from semcast.server.geometry.grey import Grey
+from semcast.server.geometry.klt import TrackedPoints, track_alike
 from semcast.server.geometry.square_distance import square_distances
 
 Array = NDArray[np.float64]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform
 from semcast.server.geometry.edges import alike, each_of
-from semcast.server.geometry.features import Grey
+from semcast.server.geometry.grey import Grey
 from semcast.server.geometry.pnp import refine_pose, search_pose
 from semcast.server.geometry.sampling import sample_colours
 from semcast.server.geometry.weighting import NoiseModel

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.server.geometry.features import Grey
+from semcast.server.geometry.grey import Grey
 from semcast.server.geometry.streaks import band_power
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 

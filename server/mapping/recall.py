@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from semcast.common.geometry import invert_transform, transform_points
 from semcast.server.geometry.brightness import MIN_POINTS, brightness_change, with_brightness
-from semcast.server.geometry.features import BORDER_PX, TrackedPoints, track_alike, track_points
+from semcast.server.geometry.corners import BORDER_PX
+from semcast.server.geometry.klt import TrackedPoints, track_alike, track_points
 from semcast.server.geometry.streaks import blurred_alike
 from semcast.server.mapping.keyframe_images import ImagedMap, SeenFrom
 from semcast.server.mapping.sight import Seen, Sight

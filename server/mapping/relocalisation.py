@@ -8,14 +8,9 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform, transform_points
-from semcast.server.geometry.features import (
-    Describer,
-    Grey,
-    count_matches,
-    detect_corners,
-    hamming,
-    match_descriptors,
-)
+from semcast.server.geometry.corners import detect_corners
+from semcast.server.geometry.descriptors import Describer, count_matches, hamming, match_descriptors
+from semcast.server.geometry.grey import Grey
 from semcast.server.geometry.pnp import PoseEstimate, refine_pose, search_pose
 from semcast.server.geometry.projection import depths_in
 from semcast.server.geometry.square_distance import square_distances

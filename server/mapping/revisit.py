@@ -17,7 +17,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.codec import KLT_WINDOW_PX
 from semcast.common.geometry import angles_between_deg, invert_transform, transform_points
 from semcast.server.geometry.epipolar import fundamental_matrix, sampson_px
-from semcast.server.geometry.features import TrackedPoints, track_points
+from semcast.server.geometry.klt import TrackedPoints, track_points
 from semcast.server.geometry.patch_alignment import Templates, affine_warps, align_patches, seen_alike
 from semcast.server.geometry.pnp import reprojection_residual
 from semcast.server.geometry.projection import MIN_DEPTH_MAP, depths_in

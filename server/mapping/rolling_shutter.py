@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.server.geometry.features import to_grey
 from semcast.server.geometry.finite_differences import slope_weights
+from semcast.server.geometry.grey import to_grey
 from semcast.server.geometry.whereabouts import SAME_S
 from semcast.server.mapping.readout import Readout
 from semcast.server.mapping.sight import Sight, usable_rows

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from semcast.common.phy.slots import BLOCK_PX
 from semcast.server.geometry.edges import alike, each_of
-from semcast.server.geometry.features import Grey
+from semcast.server.geometry.grey import Grey
 from semcast.server.geometry.sampling import nearest_pixels
 from semcast.server.geometry.streaks import band_power
 from semcast.server.geometry.wide_search import WideFeatures

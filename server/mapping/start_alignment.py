@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.server.geometry.features import Grey
+from semcast.server.geometry.grey import Grey
 from semcast.server.geometry.patch_alignment import ANCHOR_PATCH_PX, Templates, align_patches, seen_alike
 from semcast.server.geometry.projection import MIN_DEPTH_MAP
 from semcast.server.mapping.kept_frames import Observed

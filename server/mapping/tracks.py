@@ -10,16 +10,10 @@ from numpy.typing import NDArray
 from semcast.common.codec import KLT_WINDOW_PX
 from semcast.server.geometry.brightness import with_brightness
 from semcast.server.geometry.cells import cell_keys
-from semcast.server.geometry.features import (
-    Grey,
-    TrackedPoints,
-    corner_strength,
-    deduplicate,
-    detect_corners,
-    track_alike,
-    track_through_light,
-)
+from semcast.server.geometry.corners import corner_strength, deduplicate, detect_corners
 from semcast.server.geometry.flicker import flicker_between, with_row_gains
+from semcast.server.geometry.grey import Grey
+from semcast.server.geometry.klt import TrackedPoints, track_alike, track_through_light
 from semcast.server.geometry.sampling import sample_map
 from semcast.server.geometry.streaks import blurred_alike
 from semcast.server.geometry.warped_points import MAX_FROM_GUESS_PX, track_warped

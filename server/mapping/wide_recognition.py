@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform, transform_points
 from semcast.common.image import resized
-from semcast.server.geometry.features import Grey, deduplicate
+from semcast.server.geometry.corners import deduplicate
+from semcast.server.geometry.grey import Grey
 from semcast.server.geometry.patch_alignment import (
     ANCHOR_PATCH_PX,
     MIN_AREA_RATIO,

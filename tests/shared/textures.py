@@ -11,7 +11,7 @@ def layered_noise(shape_hw, sigmas_px, seed):
     return sum(layer / layer.std() for layer in layers)
 
 
-def texture(shape_hw, sigmas_px, seed, contrast=30):
+def texture(shape_hw=(240, 320), sigmas_px=(2.0, 5.0, 12.0), seed=0, contrast=30):
     """``(H, W)`` uint8 grey levels around 128, to each side by ``contrast`` for each layer."""
     return np.clip(layered_noise(shape_hw, sigmas_px, seed) * contrast + 128, 0, 255).astype(np.uint8)
 

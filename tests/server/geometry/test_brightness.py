@@ -4,9 +4,10 @@ import pytest
 from textures import shifted
 
 from semcast.common.codec import KLT_WINDOW_PX
-from semcast.server.geometry import brightness, features
+from semcast.server.geometry import brightness, klt
 from semcast.server.geometry.brightness import brightness_change, with_brightness
-from semcast.server.geometry.features import detect_corners, track_points, track_through_light
+from semcast.server.geometry.corners import detect_corners
+from semcast.server.geometry.klt import track_points, track_through_light
 
 
 @pytest.fixture
@@ -63,7 +64,7 @@ def test_points_are_followed_to_where_they_are_through_a_change_of_exposure(grey
     assert found.ok.mean() > 0.95
     assert np.median(error) < 0.08
     assert np.median(found.photometric_grey[found.ok]) < 2.0
-    monkeypatch.setattr("semcast.server.geometry.features.brightness_change", lambda *_: None)
+    monkeypatch.setattr("semcast.server.geometry.klt.brightness_change", lambda *_: None)
     without = track_points(grey, moved, corners, corners)
     assert without.ok.mean() < 0.5 * found.ok.mean()
 
@@ -71,13 +72,13 @@ def test_points_are_followed_to_where_they_are_through_a_change_of_exposure(grey
 @pytest.fixture
 def searches(monkeypatch):
     """Number of points of each Lucas-Kanade search, there and back being one."""
-    search, counts = features._search, []
+    search, counts = klt._search, []
 
     def counted(grey0, grey1, xy0, *how):
         counts.append(len(xy0))
         return search(grey0, grey1, xy0, *how)
 
-    monkeypatch.setattr(features, "_search", counted)
+    monkeypatch.setattr(klt, "_search", counted)
     return counts
 
 
@@ -113,7 +114,7 @@ def test_light_that_guesses_told_is_not_doubted_where_much_is_hidden(grey, searc
     def told(grey0, grey1, xy0, xy1, *patch_px):
         return (0.95, 0.0) if patch_px else (0.85, 0.0)
 
-    monkeypatch.setattr(features, "brightness_change", told)
+    monkeypatch.setattr(klt, "brightness_change", told)
     found, change = track_through_light(grey, moved, corners, corners + np.array([3.0, 2.0]))
     assert 0.4 < found.ok.mean() < 0.6
     assert change == (0.95, 0.0)

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from semcast.server.geometry.edges import alike, edges_at, rounded, whitened, whiteners
-from semcast.server.geometry.features import track_points
+from semcast.server.geometry.klt import track_points
 
 
 def half_plane(angle_rad, shift_px=0.0, noise_grey=0.0, seed=0):

@@ -3,8 +3,9 @@ import numpy as np
 import pytest
 from textures import shifted
 
-from semcast.server.geometry.features import detect_corners, track_points
+from semcast.server.geometry.corners import detect_corners
 from semcast.server.geometry.flicker import flicker_between, row_gains, with_row_gains
+from semcast.server.geometry.klt import track_points
 
 HEIGHT, WIDTH = 240, 320
 ALL = np.ones(HEIGHT, bool)

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from semcast.server.geometry import warped_points
-from semcast.server.geometry.features import detect_corners, track_points
+from semcast.server.geometry.corners import detect_corners
+from semcast.server.geometry.klt import track_points
 from semcast.server.geometry.warped_points import track_warped
 from semcast.server.geometry.wide_search import WideFeatures, search_wide
 

@@ -5,7 +5,7 @@ from textures import texture
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import make_transform
-from semcast.server.geometry.features import to_grey
+from semcast.server.geometry.grey import to_grey
 from semcast.server.mapping.keyframe_images import KeyframeImages, SeenFrom
 from semcast.server.mapping.sight import Sight, usable_rows
 from semcast.server.mapping.state import DecodedFrame

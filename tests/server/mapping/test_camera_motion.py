@@ -11,7 +11,7 @@ from semcast.common.geometry import exp_so3, make_transform
 from semcast.common.sequence import open_sequence
 from semcast.common.trajectory_error import ate
 from semcast.server.export.outputs import trajectory_of
-from semcast.server.geometry.features import to_grey
+from semcast.server.geometry.grey import to_grey
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.camera_motion import CameraMotion
 from semcast.server.mapping.reconstruction import Reconstruction

@@ -8,7 +8,7 @@ import pytest
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3, invert_transform, make_transform, rotation_angle_deg
-from semcast.server.geometry.features import TrackedPoints
+from semcast.server.geometry.klt import TrackedPoints
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.loop_closure import _LOOK_INTERVAL, Loop, LoopFinder, LoopView, share_out
 from semcast.server.mapping.relocalisation import MAX_CONSIDERED, Place

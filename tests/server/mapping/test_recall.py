@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from shifted_texture import CAMERA, mapped_wall, pose_at, sight_at
 
-from semcast.server.geometry import features
+from semcast.server.geometry import klt
 from semcast.server.geometry.brightness import with_brightness
 from semcast.server.mapping.keyframe_images import ImagedMap, SeenFrom
 from semcast.server.mapping.recall import recall_landmarks
@@ -45,7 +45,7 @@ def test_lost_landmarks_get_their_tracks_back(mapped):
 @pytest.mark.parametrize("gain", [0.6, 1.3])
 def test_landmarks_are_found_in_another_light_at_once_where_tracks_tell_it(mapped, monkeypatch, gain):
     _, _, tracks = mapped
-    search, searched = features._search, []
+    search, searched = klt._search, []
 
     def counted(grey0, grey1, xy0, *how):
         searched.append(len(xy0))
@@ -56,7 +56,7 @@ def test_landmarks_are_found_in_another_light_at_once_where_tracks_tell_it(mappe
     tracks.follow(sight, tracks.xy - (4, 0))
     tracks.keep(np.arange(len(tracks)) % 2 == 0)
     assert len(tracks) > 40
-    monkeypatch.setattr(features, "_search", counted)
+    monkeypatch.setattr(klt, "_search", counted)
     found = recall(mapped, sight, 24)
     assert found > 0.7 * searched[0]
     assert len(searched) == 1

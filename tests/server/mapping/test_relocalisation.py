@@ -7,7 +7,7 @@ import pytest
 from textures import texture
 
 from semcast.common.camera import Intrinsics
-from semcast.server.geometry.features import detect_corners
+from semcast.server.geometry.corners import detect_corners
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.relocalisation import _NUM_COMPARED, Relocaliser, _likeliest
 from semcast.server.mapping.sight import Sight

@@ -10,7 +10,8 @@ from textures import texture
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3, invert_transform, make_transform
-from semcast.server.geometry.features import TrackedPoints, to_grey
+from semcast.server.geometry.grey import to_grey
+from semcast.server.geometry.klt import TrackedPoints
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping import map_builder
 from semcast.server.mapping.bundle import InlineBundle

@@ -9,7 +9,7 @@ import pytest
 from textures import layered_noise
 
 from semcast.common.camera import Intrinsics
-from semcast.server.geometry.features import to_grey
+from semcast.server.geometry.grey import to_grey
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.reconstruction import Reconstruction
 from semcast.server.mapping.rolling_shutter import ImageFlow, RollingShutter, RowTimes, _at_the_end

@@ -8,7 +8,7 @@ from textures import texture
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3, make_transform
-from semcast.server.geometry.features import to_grey
+from semcast.server.geometry.grey import to_grey
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.reconstruction import Reconstruction, ReconstructionSettings
 from semcast.server.mapping.sight import Sight

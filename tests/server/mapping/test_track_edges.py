@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from semcast.server.geometry.edges import edges_at
-from semcast.server.geometry.features import to_grey
+from semcast.server.geometry.grey import to_grey
 from semcast.server.mapping.sight import Sight, usable_rows
 from semcast.server.mapping.state import DecodedFrame
 from semcast.server.mapping.tracks import TrackTable

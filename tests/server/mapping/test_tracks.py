@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from shifted_texture import CAMERA, SHAPE, START_X, begin, mapped_wall, pose_at, sight_at
 
-from semcast.server.geometry.features import to_grey
+from semcast.server.geometry.grey import to_grey
 from semcast.server.mapping.anchoring import anchor_tracks
 from semcast.server.mapping.keyframe_images import ImagedMap, KeyframeImages, SeenFrom
 from semcast.server.mapping.sight import Sight, usable_rows

@@ -46,7 +46,7 @@ def test_tracks_that_coast_are_followed_through_the_change_of_light_that_the_oth
         asked.append(len(images_and_points[2]))
         return brightness_change(*images_and_points)
 
-    monkeypatch.setattr("semcast.server.geometry.features.brightness_change", counted)
+    monkeypatch.setattr("semcast.server.geometry.klt.brightness_change", counted)
     in_band = (tracks.xy[:, 1] > 70) & (tracks.xy[:, 1] < 88)
     band_ids, band_xy = tracks.ids[in_band], tracks.xy[in_band]
     assert 5 <= len(band_ids) < 20, "so few tell no change themselves"

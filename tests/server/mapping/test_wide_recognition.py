@@ -16,7 +16,7 @@ from semcast.common.geometry import (
 from semcast.common.sequence import open_sequence
 from semcast.evaluation.scenes.orbit import Orbit
 from semcast.evaluation.scenes.render import frame_of
-from semcast.server.geometry.features import to_grey
+from semcast.server.geometry.grey import to_grey
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.keyframe_images import KeyframeImages

@@ -9,7 +9,7 @@ from test_tracks import SHAPE, begin, sight_at
 
 from semcast.evaluation.scenes.orbit import Orbit
 from semcast.evaluation.scenes.render import frame_of
-from semcast.server.geometry.features import to_grey
+from semcast.server.geometry.grey import to_grey
 from semcast.server.geometry.wide_search import WideFeatures
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.reconstruction import Reconstruction
