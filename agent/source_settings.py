@@ -4,8 +4,8 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from semcast.common.camera_settings import CameraSettings
+from semcast.common.layouts.layout import Layout
 from semcast.common.playback import check_playback
-from semcast.common.sequence_layouts import Layout
 
 Pace = Literal["recorded", "rate", "receiver"]
 Repeat = Literal["once", "loop", "swing"]

@@ -14,7 +14,7 @@ from semcast.agent.ros_bag import BagImage, RosBag
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import SourceError
 from semcast.common.new_folder import new_folder
-from semcast.common.sequence_layouts import ns_to_seconds
+from semcast.common.times import ns_to_seconds
 from semcast.common.trajectory import Trajectory, seconds_of, write_tum
 from semcast.common.whole_file import write_whole
 

@@ -22,8 +22,8 @@ from semcast.common.camera import Intrinsics
 from semcast.common.camera_settings import HOW_TO_GIVE, check_size
 from semcast.common.errors import SourceError
 from semcast.common.image_file import as_rgb
+from semcast.common.layouts.files import IMAGE_SUFFIXES
 from semcast.common.sequence import ImageRectifier, resized_wh
-from semcast.common.sequence_layouts import IMAGE_SUFFIXES
 
 logger = logging.getLogger(__name__)
 

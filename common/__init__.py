@@ -42,9 +42,9 @@ Messages and transport
     complaints              warnings about bad messages
     map_mirror              the map of a running server in another process
 
-Recorded sequences and recordings
+Recorded sequences (their folder layouts are in ``layouts``) and recordings
     sequence                a recorded sequence with random access
-    sequence_layouts        the folder layouts it is read from
+    times                   times of images: nanoseconds, and decimal seconds
     colmap_file             cameras and poses of a COLMAP model
     sequence_sizes          sizes of its image files
     image_order             the order of images by their names

@@ -16,9 +16,11 @@ from semcast.common.errors import SourceError
 from semcast.common.geometry import interpolate_pose
 from semcast.common.image import resized, scaled_wh
 from semcast.common.image_file import bit_depth_of, read_image
+from semcast.common.layouts.files import SequenceFiles
+from semcast.common.layouts.layout import Layout, read_layout
 from semcast.common.playback import check_playback, usual_period_ns
-from semcast.common.sequence_layouts import Layout, SequenceFiles, ns_to_seconds, read_layout
 from semcast.common.sequence_sizes import size_in_header_wh, states_16_bits
+from semcast.common.times import ns_to_seconds
 from semcast.common.trajectory import Trajectory, read_tum
 
 logger = logging.getLogger(__name__)

@@ -36,10 +36,10 @@ from semcast.common.cores import check_threads
 from semcast.common.errors import ConfigError, SourceError
 from semcast.common.image import psnr_db
 from semcast.common.image_file import read_image
+from semcast.common.layouts.files import IMAGE_SUFFIXES, images_in
 from semcast.common.link_report import LinkReporter
 from semcast.common.phy.slots import layout_for
 from semcast.common.rate import NATIVE_RATE, Rate, from_coded, to_coded
-from semcast.common.sequence_layouts import IMAGE_SUFFIXES, images_in
 from semcast.evaluation.calibration import reliability
 from semcast.evaluation.image_quality import ms_ssim, ssim
 from semcast.evaluation.interruption import until_interrupted

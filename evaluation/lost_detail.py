@@ -21,9 +21,9 @@ from semcast.channel.settings import ChannelSettings
 from semcast.common.codec import DEFAULT_CODEC, LABEL_SHARPNESS, Codec, DecodedImage
 from semcast.common.codecs import load_codec
 from semcast.common.image_file import read_image
+from semcast.common.layouts.files import images_in
 from semcast.common.lost_detail import ERROR_FACTORS, detail_at, scaled_errors
 from semcast.common.rate import Rate, from_coded, to_coded
-from semcast.common.sequence_layouts import images_in
 from semcast.common.source_commit import source_commit
 from semcast.evaluation.calibration import reliability
 from semcast.evaluation.report import RESULTS, check_outputs, machine_kind, write_result

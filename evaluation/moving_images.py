@@ -18,8 +18,8 @@ from semcast.common.camera import Intrinsics
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.errors import SemcastError, SourceError
 from semcast.common.image import resized
+from semcast.common.layouts.layout import Layout
 from semcast.common.playback import usual_period_ns
-from semcast.common.sequence_layouts import Layout
 from semcast.evaluation.statistics import student_quantile
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult

@@ -17,7 +17,7 @@ from semcast.common.errors import ConfigError
 from semcast.common.geometry import invert_transform
 from semcast.common.image import psnr_db
 from semcast.common.sequence import Sequence as RecordedSequence
-from semcast.common.sequence_layouts import ns_to_seconds
+from semcast.common.times import ns_to_seconds
 from semcast.evaluation.competitors import COMPETITORS
 from semcast.evaluation.interruption import until_interrupted
 from semcast.evaluation.match_truth import epipolar_distance_px, track_error_px

@@ -18,7 +18,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from semcast.common.errors import SourceError
 from semcast.common.image_file import read_image
-from semcast.common.sequence_layouts import IMAGE_SUFFIXES, images_in
+from semcast.common.layouts.files import IMAGE_SUFFIXES, images_in
 
 logger = logging.getLogger(__name__)
 

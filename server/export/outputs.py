@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from semcast import __version__
 from semcast.common.errors import SemcastError, SourceError
-from semcast.common.sequence_layouts import ns_to_seconds
+from semcast.common.times import ns_to_seconds
 from semcast.common.trajectory import Trajectory
 from semcast.common.whole_file import write_whole
 

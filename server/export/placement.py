@@ -19,7 +19,7 @@ from semcast.common.geometry import (
 )
 from semcast.common.run_folder import RunData
 from semcast.common.sequence import truth_at_frames
-from semcast.common.sequence_layouts import ns_to_seconds
+from semcast.common.times import ns_to_seconds
 from semcast.common.trajectory import Trajectory
 from semcast.common.trajectory_error import MIN_MATCHES, match_times
 from semcast.server.export.poses import rising_times

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.run_folder import RunData
-from semcast.common.sequence_layouts import ns_to_seconds
+from semcast.common.times import ns_to_seconds
 from semcast.common.trajectory import Trajectory, seconds_of, write_tum
 from semcast.common.whole_file import write_whole
 

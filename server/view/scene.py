@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.geometry import project_to_so3
-from semcast.common.sequence_layouts import ns_to_seconds
+from semcast.common.times import ns_to_seconds
 from semcast.common.trajectory import Trajectory
 from semcast.common.trajectory_error import match_times
 from semcast.server.dense.cloud import DensePatch

@@ -240,8 +240,9 @@ def _figures(summary: dict[str, Any]) -> list[tuple[str, str]]:
 
 def describe_sequence(path: Path) -> list[Section]:
     """Say what a recorded image sequence holds; what is missing is said, not an error."""
+    from semcast.common.layouts.layout import find_layout, read_layout
     from semcast.common.sequence import open_sequence
-    from semcast.common.sequence_layouts import find_layout, ns_to_seconds, read_layout
+    from semcast.common.times import ns_to_seconds
 
     layout = find_layout(path)
     sequence = open_sequence(path, layout=layout)

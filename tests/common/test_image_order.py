@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from semcast.common.image_order import in_order, natural_key, order_of
+from semcast.common.layouts.files import images_in
 from semcast.common.sequence import open_sequence
-from semcast.common.sequence_layouts import images_in
 
 
 def test_names_with_signs_that_are_no_digits_of_a_number_are_sorted(tmp_path):

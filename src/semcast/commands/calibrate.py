@@ -87,7 +87,7 @@ def image_files(paths: list[Path]) -> list[Path]:
     Raises:
         SourceError: A path does not exist, or there is no picture.
     """
-    from semcast.common.sequence_layouts import images_in
+    from semcast.common.layouts.files import images_in
 
     files: list[Path] = []
     for path in paths:
@@ -124,7 +124,7 @@ def read_pictures(files: list[Path]) -> Iterator[tuple[str, "NDArray[np.uint8]"]
 
 def is_video(path: Path) -> bool:
     """Tell whether a file is to be read as a video: one that is not named as a picture."""
-    from semcast.common.sequence_layouts import IMAGE_SUFFIXES
+    from semcast.common.layouts.files import IMAGE_SUFFIXES
 
     return path.is_file() and path.suffix.lower() not in IMAGE_SUFFIXES
 
@@ -209,7 +209,7 @@ def _collect(
 
 
 def _check_outputs(out: Path, picture: Path) -> None:
-    from semcast.common.sequence_layouts import IMAGE_SUFFIXES
+    from semcast.common.layouts.files import IMAGE_SUFFIXES
     from semcast.common.whole_file import check_writable
 
     if out.suffix.lower() != ".json":

@@ -7,8 +7,9 @@ import pytest
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import SourceError
 from semcast.common.geometry import exp_so3, invert_transform, make_transform, quat_wxyz_from_rotation
+from semcast.common.layouts.kitti import kitti_pose_places
+from semcast.common.layouts.layout import read_layout
 from semcast.common.sequence import open_sequence, truth_at_frames
-from semcast.common.sequence_layouts import kitti_pose_places, read_layout
 from semcast.common.trajectory import Trajectory, write_tum
 
 CAMERA = Intrinsics(fx=30.0, fy=31.0, cx=15.5, cy=11.5, width=32, height=24)
