@@ -1,5 +1,6 @@
 """Work one problem at a time: in a child process, started again when it dies, or in the caller's thread."""
 
+import atexit
 import contextlib
 import logging
 import multiprocessing
@@ -17,7 +18,7 @@ from typing import Generic, Protocol, TypeVar
 
 from semcast.common.errors import tell_nobody
 from semcast.common.heap import keep_freed_memory
-from semcast.common.interrupts import deaf_children
+from semcast.common.interrupts import deaf_children, ending_signals
 
 logger = logging.getLogger(__name__)
 
@@ -113,7 +114,9 @@ def serve(connection: Connection, work: Callable[[Problem], Result], stands_back
 
     Work that raises, or whose result can't be sent, is answered with why; the next one is another matter.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # on Windows nothing else keeps Ctrl-C away
+    # Signals that end a run go to the whole group of processes, and what this one is at is still wanted then.
+    for number in (signal.SIGINT, *ending_signals()):
+        signal.signal(number, signal.SIG_IGN)
     keep_freed_memory()
     if stands_back:
         _stand_back()
@@ -217,6 +220,7 @@ class Worker(Generic[Problem, Result]):
         self._closed = False
         self._failures = 0
         self._is_due = not start_early
+        atexit.register(self._kill)
         if start_early:
             self._start()
 
@@ -321,11 +325,18 @@ class Worker(Generic[Problem, Result]):
             logger.debug("%s", answer.trace)
         return answer.result
 
+    def _kill(self) -> None:
+        """End the child at once; at exit, if nobody has closed this.
+
+        ``multiprocessing`` would then ask the child to end, which it is deaf to, and wait for it.
+        """
+        if self._process is not None:
+            self._process.kill()
+
     def _end_exchange(self) -> None:
         """End what the child is at, and with it the child."""
         if self._exchange is not None and self._exchange.is_alive():
-            if self._process is not None:
-                self._process.kill()
+            self._kill()
             self._exchange.join(_CLOSE_DEADLINE_S)
 
     def _stop(self) -> None:
@@ -348,5 +359,6 @@ class Worker(Generic[Problem, Result]):
         """End the child. Idempotent."""
         if not self._closed:
             self._closed = True
+            atexit.unregister(self._kill)
             self._stop()
             self._exchange = None

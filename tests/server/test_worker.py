@@ -3,11 +3,14 @@
 import logging
 import os
 import signal
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
 import pytest
 
+from semcast.common.interrupts import ending_signals
 from semcast.server.worker import Worker
 
 WHAT = "the test's child"
@@ -48,6 +51,32 @@ def return_what_cannot_be_sent(problem):
 
 def end_at_once(problem):
     os._exit(3)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, *ending_signals()])
+def test_what_asks_a_group_of_processes_to_end_leaves_the_child_at_work(make, number, caplog):
+    worker = make(abs)
+    assert answer(worker, -1) == 1
+    pid = worker.pid
+    os.kill(pid, number)
+    assert answer(worker, -2) == 2
+    assert worker.pid == pid
+    assert not [r for r in caplog.records if r.name == "semcast.server.worker"]
+
+
+def test_a_child_that_nobody_closes_keeps_no_script_from_its_end(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from semcast.server.worker import Worker\n"
+        "if __name__ == '__main__':\n"
+        "    kept = Worker(abs, name='test', what='the child', given_up='it is no more')\n"
+        "    assert kept.submit(-3) and kept.take(wait=True) == 3\n"
+        "    print(kept.pid)\n"
+    )
+    ended = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=30)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(ended.stdout), 0)
 
 
 def test_a_child_begins_with_its_first_problem_where_that_is_wanted(make):
@@ -125,7 +154,7 @@ def test_nothing_is_left_of_children_that_were_killed_stopped_or_could_not_start
 
     worker = make(abs)
     pids = []
-    for number in (signal.SIGKILL, signal.SIGSTOP, signal.SIGTERM):
+    for number in (signal.SIGKILL, signal.SIGSTOP, signal.SIGABRT):
         assert answer(worker, -1) == 1
         pids.append(worker.pid)
         os.kill(worker.pid, number)
