@@ -34,8 +34,9 @@ Beginning and end of a stream
     conclusion        the last adjustment and missing depth
 
 One stream
-    session           the map of one start of one agent, its rows, checkpoint and outputs
+    session           the map of one start of one agent and its outputs
     session_cloud     its dense cloud
+    session_records   its rows, checkpoints and images, written on the way
     bundle_runner     where its bundle adjustment runs
     checkpoint        what a restarted server needs to go on with the map
     metres            the scale of the map, by a printed marker

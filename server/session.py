@@ -1,6 +1,5 @@
 """Everything that belongs to one start of one agent: its map, its rows, its checkpoint and its outputs."""
 
-import contextlib
 import logging
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -15,27 +14,17 @@ from numpy.typing import NDArray
 
 from semcast.common.config import settings_to_dict, to_toml
 from semcast.common.errors import CheckpointError, tell_nobody
-from semcast.common.run_folder import (
-    CHECKPOINT_NAME,
-    DENSE_NAME,
-    FRAMES_NAME,
-    IMAGES_NAME,
-    RECORD_FILES,
-    RESULT_FILES,
-    SETTINGS_NAME,
-    SUMMARY_NAME,
-)
+from semcast.common.run_folder import CHECKPOINT_NAME, DENSE_NAME, FRAMES_NAME, SETTINGS_NAME, SUMMARY_NAME
 from semcast.common.whole_file import write_whole
 from semcast.server.bundle_runner import new_bundle
-from semcast.server.checkpoint import Checkpoint, CheckpointHeader, CheckpointWriter, checkpoint_of
+from semcast.server.checkpoint import Checkpoint, CheckpointHeader, checkpoint_of
 from semcast.server.decoder import Arrival
 from semcast.server.dense.cloud import DensePatch
 from semcast.server.export.outputs import EachFile, versions, write_json, write_ply
 from semcast.server.export.parts import after_gaps
 from semcast.server.former_run import set_aside
-from semcast.server.frame_rows import FrameRow, FrameRows, run_line, summarise, too_much
+from semcast.server.frame_rows import FrameRow, run_line, summarise, too_much
 from semcast.server.frame_views import frame_view
-from semcast.server.image_writer import ImageWriter
 from semcast.server.mapping.bundle_problem import BundleRunner
 from semcast.server.mapping.reconstruction import Reconstruction
 from semcast.server.mapping.state import DecodedFrame, FrameResult, MapUpdate, TrackingState
@@ -44,6 +33,7 @@ from semcast.server.reference import Reference
 from semcast.server.run_results import Results, results_of, write_results
 from semcast.server.sent_frames import stretches
 from semcast.server.session_cloud import SessionCloud
+from semcast.server.session_records import SessionRecords
 from semcast.server.settings import ServerSettings
 from semcast.server.stream_identity import StreamIdentity
 from semcast.server.view.frame_view import FrameView
@@ -97,7 +87,6 @@ class Session:
         self._settings = settings
         self._program = program if program is not None else settings
         self.identity = identity
-        self._folder = folder
         self._on_error = on_error
         self._reference = reference
         self._bundle = bundle if bundle is not None else new_bundle(settings)
@@ -116,17 +105,15 @@ class Session:
         self._is_concluded = False
         self._told = ""
         self._last_checkpoint_s = time.monotonic()
-        self._checkpoints: CheckpointWriter | None = None
-        self._images: ImageWriter | None = None
-        self._record = FrameRows(None)
         self.resumed = False
+        self._records = self._recorded_in(None)
         if folder is not None:
             try:
                 self._open(folder)
             except BaseException:
                 self.close()
                 raise
-        for row in (rows := self._record.rows()):
+        for row in (rows := self._records.rows.rows()):
             self._t_source_ns[row.frame_id] = row.t_source_ns
             self._numbers[row.frame_id] = row.seq
         #: Poses of a restored map that the viewer has not seen yet.
@@ -135,16 +122,15 @@ class Session:
 
     def _open(self, folder: Path) -> None:
         """Take up what a folder holds of this stream, and begin to write into it."""
-        settings = self._settings
         folder.mkdir(parents=True, exist_ok=True)
-        self.resumed = settings.resume and self._restore(folder / CHECKPOINT_NAME)
+        self.resumed = self._settings.resume and self._restore(folder / CHECKPOINT_NAME)
         if not self.resumed:
             set_aside(folder)
-        self._record = FrameRows(folder, resume=self.resumed, on_error=self._on_error)
-        self._checkpoints = CheckpointWriter(folder / CHECKPOINT_NAME, self._on_error)
-        if settings.save_images != "none":
-            lossless = settings.mode == "replay"
-            self._images = ImageWriter(folder, lossless=lossless, on_error=self._on_error)
+        self._records = self._recorded_in(folder)
+
+    def _recorded_in(self, folder: Path | None) -> SessionRecords:
+        how = self._settings, self._reconstruction
+        return SessionRecords(folder, *how, resume=self.resumed, on_error=self._on_error)
 
     @property
     def last_frame_id(self) -> int:
@@ -246,9 +232,9 @@ class Session:
             age_ms=(tracked_ns - arrival.t_arrival_ns) * 1e-6,
             stage_ms={**arrival.stages_to_pose_ms(tracked_ns), **result.stage_ms},
         )
-        self._record.add(row)
+        self._records.rows.add(row)
         update = self.metres.follow(update, frame, result)
-        self._keep_image(frame, result, update)
+        self._records.keep_image(frame, result, update)
         self._map_epoch = result.map_epoch
         if time.monotonic() - self._last_checkpoint_s >= self._settings.checkpoint_interval_s:
             self.save_checkpoint()
@@ -278,21 +264,6 @@ class Session:
             what = "the camera is lost" if is_lost else "waiting for a map to begin"
         logger.info("frame %d: %s", result.frame_id, what)
 
-    def _keep_image(self, frame: DecodedFrame, result: FrameResult, update: MapUpdate | None) -> None:
-        """Keep the decoded image where the settings want it, as poses and observations fit it.
-
-        A start makes keyframes of earlier frames.
-        """
-        if self._images is None:
-            return
-        waits = result.state is not TrackingState.TRACKING  # a later part of the map begins from lost frames
-        if result.is_keyframe or waits or self._settings.save_images == "all":
-            image = self._reconstruction.put_right(frame.image)
-            provisional = waits and self._settings.save_images == "keyframes"
-            self._images.put(frame.frame_id, image, provisional=provisional)
-        if result.backfilled and update is not None:
-            self._images.settle(update.keyframe_ids.tolist())
-
     def _await(self, quality: "Future[float | None] | None") -> float | None:
         if quality is None:
             return None
@@ -305,12 +276,12 @@ class Session:
     def save_checkpoint(self) -> None:
         """Hand the map to the checkpoint writer; a no-op without a folder or before the first frame."""
         self._last_checkpoint_s = time.monotonic()
-        if self._checkpoints is None or self._last_frame_id < 0:
+        if not self._records.takes_checkpoints or self._last_frame_id < 0:
             return
         t_source_ns = self._t_source_ns.get(self._last_frame_id, 0)
         header = CheckpointHeader.of(self.identity, self._last_frame_id, t_source_ns, self._map_epoch)
         arrays = {**self._reconstruction.snapshot(), **self.metres.arrays()}
-        self._checkpoints.submit(Checkpoint(header, arrays))
+        self._records.write_checkpoint(Checkpoint(header, arrays))
 
     def whole_map(self) -> MapUpdate:
         """Return the map as one update, for who has seen none before."""
@@ -401,7 +372,7 @@ class Session:
         """
         with EachFile() as each:
             with each.attempt(Path(FRAMES_NAME)):
-                self._record.finish()
+                self._records.rows.finish()
             results = self._write_results(folder, each)
             summary = self._summary(results, drops, complete, num_sent)
             if folder is not None:
@@ -419,7 +390,7 @@ class Session:
     def _summary(
         self, results: Results, drops: Mapping[str, int], complete: bool, num_sent: int | None
     ) -> dict[str, Any]:
-        rows = self._record.rows()
+        rows = self._records.rows.rows()
         truth = self._reference.truth_of(self._t_source_ns) if self._reference is not None else None
         if truth is not None and rows:
             # Errors are a share of the way that was gone, and not of all that the source has.
@@ -476,25 +447,11 @@ class Session:
         return results
 
     def move_records(self, folder: Path) -> None:
-        """Move what was written on the way to another folder, the viewer's file too, after ``close``.
-
-        Results that were saved on the way, or by a run that this one resumed, give way to those there.
-        """
-        if self._folder is None:
-            return
-        for name in (*RECORD_FILES, IMAGES_NAME, *RESULT_FILES):
-            with contextlib.suppress(FileNotFoundError):
-                if name in RESULT_FILES and (folder / name).exists():
-                    (self._folder / name).unlink()
-                else:
-                    (self._folder / name).rename(folder / name)
+        """Move what was written on the way to another folder, after ``close``, see ``SessionRecords``."""
+        self._records.move(folder)
 
     def close(self) -> None:
         """End threads and processes. Idempotent; outputs are written by ``write_outputs`` before."""
-        if self._checkpoints is not None:
-            self._checkpoints.close()
-        if self._images is not None:
-            self._images.close()
-        self._record.close()
+        self._records.close()
         self._reconstruction.close()
         self._cloud.close()
