@@ -69,11 +69,13 @@ Bundle adjustment
     dense_bundle      Levenberg-Marquardt with the Schur complement in numpy
     bundle_process    the same in a process of its own
     window_covariance how well a window's keyframes are known, with errors that neighbours share (jackknife)
+    adjuster          asks for adjustments of a growing map, and takes them and what they tell
     adjustment        brings the result into the map, and lets what it had no room for follow
     whole_map         the adjustment of all keyframes at the end of a stream
     steps             relative poses that tracking found, as constraints between keyframes
 
 Getting lost, and places seen again
+    recognition       which of the next two is asked, and where the camera can be
     relocalisation    binary descriptors against keyframes, then PnP; joining two submaps
     wide_recognition  the same by SIFT and warped patches, from further off
     visual_gyroscope  how a camera without a pose turns

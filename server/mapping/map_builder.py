@@ -2,7 +2,6 @@
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +10,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform, transform_points
 from semcast.server.geometry.weighting import GATE_SIGMAS, OnlineNoise
 from semcast.server.geometry.whereabouts import Whereabouts
-from semcast.server.mapping.adjustment import apply_result, place_left_out
+from semcast.server.mapping.adjuster import Adjuster
 from semcast.server.mapping.anchoring import anchor_tracks, resembles
 from semcast.server.mapping.bridging import Bridge
 from semcast.server.mapping.bundle_problem import BundleResult, BundleRunner
@@ -28,6 +27,7 @@ from semcast.server.mapping.pose_covariance import pose_covariance
 from semcast.server.mapping.readout_watch import ReadoutWatch
 from semcast.server.mapping.rebuilding import put_straight
 from semcast.server.mapping.recall import recall_landmarks
+from semcast.server.mapping.recognition import Recogniser
 from semcast.server.mapping.relocalisation import Place, Relocaliser, submap_similarity
 from semcast.server.mapping.revisit import Revisit, find_revisit, old_sigma_px, place_anew
 from semcast.server.mapping.rolling_shutter import ImageFlow
@@ -38,9 +38,7 @@ from semcast.server.mapping.start_geometry import Start
 from semcast.server.mapping.submap_placement import SubmapPlacement
 from semcast.server.mapping.track_ids import shared_rows
 from semcast.server.mapping.tracks import TrackTable
-from semcast.server.mapping.whole_map import adjust_whole_map
 from semcast.server.mapping.wide_recognition import WideRecogniser
-from semcast.server.mapping.window import build_problem
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 logger = logging.getLogger(__name__)
@@ -56,10 +54,6 @@ _ENOUGH_SHARE = 0.2
 _MAX_TRACKS_SHARE = 1.2
 #: The newest keyframes, which stay where older ones are thinned out: an adjustment's window is among them.
 _MAX_RECENT = 40
-#: Steps of the adjustments of a start, which is far from where it ends,
-_START_ITERATIONS = 15
-#: and of a window, which was adjusted before but for its newest keyframe.
-_ITERATIONS = 6
 
 
 class MapBuilder:
@@ -81,28 +75,30 @@ class MapBuilder:
     ) -> None:
         self._camera = camera
         self._settings = settings
-        self._bundle = bundle
+        self._adjuster = Adjuster(camera, settings, bundle)
         self._on_moved = on_moved
-        self.watch = ReadoutWatch(camera, is_wanted=settings.watches_readout(camera))
         self.clear()
 
     def clear(self) -> None:
         """Forget the map; an adjustment under way is not applied any more."""
         s = self._settings
-        self._abandon_adjustment()
-        self.watch.forget_frames()
+        self._adjuster.begin()
         self.world = WorldMap()
-        self.noise = OnlineNoise(s.confidence, s.sigma0_px, s.beta, s.fit_noise)
         self.relocaliser = Relocaliser(self._camera, s.seed, s.max_features)
-        self._wide = WideRecogniser(self._camera, s.seed)
+        self._recogniser = Recogniser(self.relocaliser, WideRecogniser(self._camera, s.seed))
         self.enter(0)
         self.num_inliers_at_keyframe = 0
         self.images = KeyframeImages(_MAX_IMAGES)
 
-    def _abandon_adjustment(self) -> None:
-        """Free the runner before the map changes; what it was asked before does not apply any more."""
-        if self._bundle.busy:
-            self._bundle.take(wait=True)
+    @property
+    def noise(self) -> OnlineNoise:
+        """Of observations."""
+        return self._adjuster.noise
+
+    @property
+    def watch(self) -> ReadoutWatch:
+        """Whether adjustments tell of a rolling shutter, or of another lens."""
+        return self._adjuster.watch
 
     @property
     def _mapped(self) -> ImagedMap:
@@ -175,11 +171,11 @@ class MapBuilder:
             born[np.isin(start.ids, keyframe.ids, assume_unique=True)] = keyframe.frame_id
         rgb = colours_of(start.ids, history)
         self.world.add_landmarks(start.ids, xyz, rgb, start.confidence, self.submap, born)
-        self._submit(start=True)
+        self._adjuster.submit(self.world, self.submap, start=True)
         self.collect(wait=True)
         self._add_landmarks(sight.frame.image)
         self._bound()
-        self._submit(start=True)
+        self._adjuster.submit(self.world, self.submap, start=True)
         self.collect(wait=True)
         self._count_inliers(tracks.ids[tracks.visible])
 
@@ -201,26 +197,7 @@ class MapBuilder:
             T_world_guess: Where its motion leads the camera, None where that is not known.
             whereabouts: Where it can be in the submap of the newest keyframe, None for anywhere.
         """
-        last, noise = self.world.keyframes[-1].submap, self.noise.model
-        astray: list[Place] = []
-
-        def is_possible(place: Place) -> bool:
-            if whereabouts is None or place.submap != last or whereabouts.holds(place.T_world_cam):
-                return True
-            astray.append(place)
-            return False
-
-        place = self.relocaliser.find(sight, self.world, noise, is_possible=is_possible)
-        if place is None:
-            place = self._wide.find(sight, self.world, self.images, noise, T_world_guess)
-        if place is not None and is_possible(place):
-            return place
-        if whereabouts is None or not astray:
-            return None
-        # The next one of a row of equal things is turned alike: that and the motion tell where the camera is.
-        T_world_cam = whereabouts.turned_alike(astray[0].T_world_cam)
-        place = self._wide.look(sight, self.world, self.images, noise, T_world_cam)
-        return place if place is None or is_possible(place) else None
+        return self._recogniser.find(sight, self._mapped, self.noise.model, T_world_guess, whereabouts)
 
     def resembles(self, tracks: TrackTable, sight: Sight, T_world_cam: Array, ids: Ids) -> bool:
         """Tell whether tracks that agree with a pose show what the newest keyframes saw."""
@@ -267,7 +244,7 @@ class MapBuilder:
             self.loops.refuse()
             return False
         keyframe_ids, solved = found
-        self._abandon_adjustment()
+        self._adjuster.abandon()
         self.world.bend(keyframe_ids, solved.T_world_cam, solved.scale)
         self.world.revisits[loop.keyframe_id] = loop.place.keyframe_id
         ends = loop.place.keyframe_id, loop.keyframe_id
@@ -344,7 +321,7 @@ class MapBuilder:
         self._add_landmarks(frame.image)
         self._count_inliers(ids)
         self._bound()
-        self._submit()
+        self._adjuster.submit(self.world, self.submap)
 
     def _tie_to_recognised(self, frame_id: int) -> None:
         """Tie a keyframe to the one the camera was found back at, where no adjustment would take that one in.
@@ -376,32 +353,9 @@ class MapBuilder:
         if self.world.bound(s.max_landmarks, s.max_keyframes, recent=min(_MAX_RECENT, s.max_keyframes // 2)):
             self.images.keep({k.frame_id for k in self.world.keyframes})
 
-    def _submit(self, *, start: bool = False) -> None:
-        if self._bundle.busy:
-            return
-        mine = len(self.world.keyframes_of(self.submap))
-        problem = build_problem(
-            self.world,
-            self._camera,
-            self.noise.model,
-            self._settings.window_size,
-            start=start or mine <= self._settings.window_size // 2,
-            iterations=_START_ITERATIONS if start else _ITERATIONS,
-        )
-        if problem is not None:
-            motion = self.watch.motion(self.world, problem)
-            self._bundle.submit(replace(problem, motion=motion, solver=self._settings.bundle_solver))
-
     def collect(self, *, wait: bool = False) -> BundleResult | None:
         """Bring a finished adjustment into the map; the result, or None where there is none."""
-        result = self._bundle.take(wait=wait)
-        if result is None:
-            return None
-        apply_result(self.world, result, self.noise)
-        place_left_out(self.world, self._camera, self.noise.model, result)
-        self.world.drift.take(result)
-        self.watch.take(result)
-        return result
+        return self._adjuster.collect(self.world, wait=wait)
 
     def finish(self) -> None:
         """Wait for an adjustment under way."""
@@ -410,9 +364,9 @@ class MapBuilder:
 
     def put_right(self, camera: Intrinsics, flows: Mapping[int, ImageFlow]) -> None:
         """Make up for a rolling shutter that was not known of, see ``put_map_right``, and adjust the map."""
-        self._abandon_adjustment()
+        self._adjuster.abandon()
         put_map_right(self.world, self.images, camera, flows)
-        self._submit(start=True)
+        self._adjuster.submit(self.world, self.submap, start=True)
         self.collect(wait=True)
 
     def put_straight(self, image: NDArray[np.uint8]) -> list[Keyframe]:
@@ -421,7 +375,7 @@ class MapBuilder:
         moved = put_straight(self._contradiction, self._mapped, noise, self._settings, settle=self.finish)
         if moved:
             self._add_landmarks(image)
-            self._submit()
+            self._adjuster.submit(self.world, self.submap)
             self.collect(wait=True)
             self._count_inliers(moved[-1].ids)
         return moved
@@ -429,10 +383,7 @@ class MapBuilder:
     def adjust_whole(self) -> int:
         """Adjust all keyframes with all they see, and say how many. Takes seconds where there are many."""
         self.finish()
-        self.watch.conclude()
-        if not self._settings.final_adjustment:
-            return 0
-        num_adjusted = adjust_whole_map(self.world, self._camera, self.noise.model)
+        num_adjusted = self._adjuster.adjust_whole(self.world)
         if num_adjusted:
             self._on_moved(1.0)
         return num_adjusted
@@ -444,7 +395,7 @@ class MapBuilder:
 
     def move_guessed(self, submap: int, scale: float, T_new_old: Array, guess: GuessedPlace) -> float:
         """Move a submap by a similarity to where it is now guessed to be; returns the factor on lengths."""
-        self._abandon_adjustment()
+        self._adjuster.abandon()
         self.world.transform_submap(submap, submap, scale, T_new_old)
         self.world.guesses[submap] = guess
         self._on_moved(scale)
@@ -481,7 +432,7 @@ class MapBuilder:
         depth = self.depth() * (scale if is_newer else 1.0)
         if not may_join(older, newer, *join, posed_ids=posed_ids, depth=depth):
             return None
-        self._abandon_adjustment()
+        self._adjuster.abandon()
         moving, staying = (self.submap, place.submap) if is_newer else (place.submap, self.submap)
         moved_ids = [k.frame_id for k in self.world.keyframes_of(moving)]
         leader_id = place.keyframe_id if is_newer else self.world.keyframes_of(staying)[-1].frame_id

@@ -140,7 +140,7 @@ def test_an_adjustment_that_can_not_be_applied_between_two_frames_does_not_end_t
     settings = ServerSettings(bundle="inline", out=tmp_path, dense_cloud="none")
     session = Session(settings, identity, tmp_path, None, on_error=told.append)
 
-    def fails(self, *, wait=False):
+    def fails(self, world, *, wait=False):
         self._bundle.take(wait=wait)
         raise np.linalg.LinAlgError("singular")
 
@@ -150,7 +150,7 @@ def test_an_adjustment_that_can_not_be_applied_between_two_frames_does_not_end_t
             frame = DecodedFrame(k, int(demo.times_ns[k]), demo.image(k), None)
             outcome = session.process(frame, Arrival(None, None, now_ns, now_ns, {}, {}))
             with monkeypatch.context() as patch:
-                patch.setattr("semcast.server.mapping.map_builder.MapBuilder.collect", fails)
+                patch.setattr("semcast.server.mapping.adjuster.Adjuster.collect", fails)
                 session.use_time()
             assert not session.is_adjusting
     assert outcome.result.T_world_cam is not None

@@ -235,7 +235,7 @@ def test_results_are_written_where_the_adjustment_at_the_end_fails(demo, tmp_pat
     def fail(*_):
         raise RuntimeError("out of memory")
 
-    monkeypatch.setattr("semcast.server.mapping.map_builder.adjust_whole_map", fail)
+    monkeypatch.setattr("semcast.server.mapping.adjuster.adjust_whole_map", fail)
     run_session(demo, tmp_path, range(12))
     assert "could not be adjusted as a whole" in caplog.text
     assert len(read_run(tmp_path).frame_ids) >= 8

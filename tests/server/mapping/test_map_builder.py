@@ -7,7 +7,6 @@ import pytest
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3, invert_transform, make_transform, transform_points
-from semcast.server.geometry.whereabouts import Whereabouts
 from semcast.server.mapping.bridging import Bridge
 from semcast.server.mapping.bundle import optimise
 from semcast.server.mapping.guessed_place import GuessedPlace
@@ -142,7 +141,7 @@ def test_a_young_map_keeps_its_scale_when_the_camera_comes_back_to_its_beginning
 
 def test_covariance_is_carried_from_the_adjusted_keyframe_along_the_way_to_the_frame(builder):
     add_part(builder, 0, 6, 0)
-    builder._submit()
+    builder._adjuster.submit(builder.world, 0)
     builder.collect(wait=True)
     here = builder.world.poses[5]
     nothing = np.zeros((6, 6))
@@ -157,7 +156,7 @@ def test_covariance_is_carried_from_the_adjusted_keyframe_along_the_way_to_the_f
 
 def test_covariance_of_another_part_is_not_carried_over(builder):
     add_part(builder, 0, 6, 0)
-    builder._submit()
+    builder._adjuster.submit(builder.world, 0)
     builder.collect(wait=True)
     own = 1e-6 * np.eye(6)
     assert builder.pose_covariance(own, builder.world.poses[5]).trace() > own.trace()
@@ -340,34 +339,3 @@ def test_a_camera_found_back_in_the_newest_keyframes_needs_no_tie(builder):
     sight = Sight(DecodedFrame(20, 20, IMAGE), IMAGE[..., 0], np.ones(480, bool))
     builder.make_keyframe(sight, NewestFrame(ids, seen(xyz, pose(0.55))), pose(0.55))
     assert builder.world.revisits == {}
-
-
-class Recognises:
-    """Takes each image for one place, and what it is asked to look at for the right one."""
-
-    def __init__(self, T_world_cam):
-        self.place = Place(T_world_cam, 0, np.arange(30), np.zeros((30, 2)), 0)
-        self.looked_at = []
-
-    def find(self, *_, is_possible=lambda place: True):
-        return self.place if is_possible(self.place) else None
-
-    def look(self, sight, world, images, noise, T_world_cam):
-        self.looked_at.append(T_world_cam)
-        return replace(self.place, T_world_cam=T_world_cam)
-
-
-def test_the_next_one_of_a_row_tells_how_the_camera_turned_and_motion_where_it_is(builder):
-    add_part(builder, 0, 5, 0)
-    sight = Sight(DecodedFrame(20, 20, IMAGE), IMAGE[..., 0], np.ones(480, bool))
-    there = Whereabouts(np.eye(4), np.array([0.0, 0.0, 1.0]), 0.5)
-    turn = exp_so3((0.0, np.pi / 2, 0.0))
-    bent = np.array([2 / np.pi, 0.0, 2 / np.pi])
-    for x, is_there in ((2.0, False), (0.3, True)):
-        builder.relocaliser = builder._wide = Recognises(make_transform(turn, bent + np.array((x, 0.0, 0.0))))
-        place = builder.recognise(sight, np.eye(4), there)
-        assert (not builder._wide.looked_at) == is_there
-        np.testing.assert_allclose(
-            place.T_world_cam, make_transform(turn, bent + np.array((x * is_there, 0.0, 0.0)))
-        )
-    assert builder.recognise(sight, None, None) is builder._wide.place, "anywhere"

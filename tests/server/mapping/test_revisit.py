@@ -221,7 +221,7 @@ def test_old_landmarks_get_tracks_and_young_tracks_in_their_places_give_way(mapp
     old = np.isin(tracks.ids, again)
     assert away[old][:, ~old].min() > 4.0
     assert np.all(world.landmarks.last_seen[world.landmarks.rows(again)] == 100)
-    builder._bundle.close()
+    builder._adjuster._bundle.close()
 
 
 def test_what_can_not_be_used_costs_no_young_track(mapped, rng):
