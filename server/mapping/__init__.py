@@ -16,6 +16,7 @@ The frame
 
 Tracks (2D)
     tracks            the table of tracks: KLT from image to image, new corners, confidence
+    recent_images     the newest images, from which tracks are followed: in one light, and after a jump
     track_ids         where ids stand among others: what two images, or an image and the map, share
     found             where tracks were found in an image, as one search follows another
     standing          tracks fixed in the image: a bonnet, a watermark, dirt on the lens

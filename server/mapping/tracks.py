@@ -8,14 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.codec import KLT_WINDOW_PX
-from semcast.server.geometry.brightness import with_brightness
 from semcast.server.geometry.cells import cell_keys
 from semcast.server.geometry.corners import corner_strength, deduplicate, detect_corners
-from semcast.server.geometry.flicker import flicker_between, with_row_gains
-from semcast.server.geometry.grey import Grey
+from semcast.server.geometry.flicker import flicker_between
 from semcast.server.geometry.klt import TrackedPoints, track_alike, track_through_light
 from semcast.server.geometry.sampling import sample_map
-from semcast.server.geometry.streaks import blurred_alike
 from semcast.server.geometry.warped_points import MAX_FROM_GUESS_PX, track_warped
 from semcast.server.geometry.weighting import (
     ConfidenceMode,
@@ -25,9 +22,9 @@ from semcast.server.geometry.weighting import (
     observation_edges,
     variance_confidence,
 )
-from semcast.server.geometry.wide_search import Carried, WideFeatures, has_finer, search_wide
 from semcast.server.mapping.found import Found
 from semcast.server.mapping.passing import Passing
+from semcast.server.mapping.recent_images import RecentImages
 from semcast.server.mapping.sight import Seen, Sight
 from semcast.server.mapping.standing import is_fixed, may_be_fixed, stood
 
@@ -41,8 +38,6 @@ MAX_COAST = 3
 _LOST_MARGIN_PX = 1
 #: Share of tracks that must be found again; below, the frame counts as damaged and all tracks coast.
 _MIN_FOUND_SHARE = 0.35
-#: Number of matches that tell how what is around most tracks was warped.
-_PLENTY_OF_MATCHES = 80
 #: A track this far from where descriptors lead to has found something else.
 _REFUTED_PX = 3.0
 #: Side of the cells that tell which tracks are beside a point.
@@ -80,10 +75,7 @@ class TrackTable:
         self._max_features = max_features
         self._rng = np.random.default_rng(seed)
         self.next_id = 0
-        self._greys: list[Grey] = []
-        self._sights: list[Sight] = []  # the newest two
-        self._bands: list[Array] = []
-        self._frame_ids: list[int] = []
+        self._images = RecentImages(MAX_COAST)
         self._jumped = False
         self.passing = Passing(max_features, turntable)
         self.clear()
@@ -141,7 +133,7 @@ class TrackTable:
     @property
     def frame_ids(self) -> list[int]:
         """Frames of the images tracks are followed from, newest first: ``missed`` is an index into them."""
-        return self._frame_ids[::-1]
+        return self._images.frame_ids
 
     def keep(self, mask: NDArray[np.bool_]) -> None:
         """Forget tracks outside the mask."""
@@ -150,9 +142,8 @@ class TrackTable:
 
     def as_they_are(self) -> dict[str, object]:
         """All there is, for ``put_back``."""
-        # Arrays and images are replaced and never written to, lists of them are.
-        kept = {name: copy(v) if isinstance(v, list) else v for name, v in vars(self).items()}
-        return {**kept, "passing": copy(self.passing)}
+        # Arrays are replaced and never written to.
+        return {**vars(self), "_images": copy(self._images), "passing": copy(self.passing)}
 
     def put_back(self, kept: dict[str, object]) -> None:
         """Let tracks be what they were when ``as_they_are`` was called."""
@@ -195,21 +186,22 @@ class TrackTable:
         found = Found.nothing(self.xy)
         guess_xy = np.where(self.fixed[:, None], self.xy, guess_xy)
         is_in_light = False
-        behind, count = np.unique(self.missed[self.missed < len(self._greys)], return_counts=True)
+        behind, count = np.unique(self.missed[self.missed < len(self._images)], return_counts=True)
         # Those that are most come first: of one image all the others may be, and a few can't tell the light.
         for back in behind[np.argsort(-count, kind="stable")]:
             rows = np.flatnonzero(self.missed == back)
             way = self.xy[rows], guess_xy[rows]
             if not is_in_light:
-                self._bring_to_lamps(flicker_between(self._greys[-1 - back], sight.grey, *way, sight.usable))
-            grey = self._greys[-1 - back]
-            images = blurred_alike(grey, sight.grey, self._bands[-1 - back], sight.band_power)
+                gains = flicker_between(self._images[back], sight.grey, *way, sight.usable)
+                self._images.bring_to_lamps(gains)
+            grey = self._images[back]
+            images = self._images.blurred_alike(back, sight)
             if is_in_light:
                 points = track_alike(*images, *way, max_level=max_level)
             else:
                 points, change = track_through_light(*images, *way, max_level=max_level)
-                self._bring_to_light(change)
-                grey, is_in_light = self._greys[-1 - back], True
+                self._images.bring_to_light(change)
+                grey, is_in_light = self._images[back], True
             found.take(rows, points)
             if not sight.usable.all():
                 found.look_again(grey, sight.grey, self.xy, guess_xy, rows)
@@ -217,24 +209,11 @@ class TrackTable:
         coasting = hidden & ~found.ok
         of_scene = ~self.fixed
         if (found.ok & of_scene).sum() < _MIN_FOUND_SHARE * max(1, int((of_scene & ~hidden).sum())):
-            jumped = self._jump(sight, found) if len(self._greys) else False
+            jumped = self._jump(sight, found) if len(self._images) else False
             self._jumped = True
             coasting = self._hidden(sight, found, guess_xy) & ~found.ok if jumped else ~found.ok
         self._settle(sight, found, coasting)
         self.remember(sight)
-
-    def _bring_to_light(self, change: tuple[float, float] | None) -> None:
-        """Let the images that tracks are followed from be as bright as the newest one, if they are not.
-
-        All of them were as bright as the last one, so what most tracks tell of it holds for all.
-        """
-        if change is not None:
-            self._greys = [with_brightness(grey, *change) for grey in self._greys]
-
-    def _bring_to_lamps(self, gains: Array | None) -> None:
-        """Let the images that tracks are followed from have the bands of light of the newest one."""
-        if gains is not None:
-            self._greys = [with_row_gains(grey, gains) for grey in self._greys]
 
     def follow_again(self, sight: Sight, guess: Callable[["TrackTable"], Array]) -> bool:
         """Look again for what ``follow`` just looked for, from another guess.
@@ -246,7 +225,7 @@ class TrackTable:
         Returns:
             Whether there was anything to look for.
         """
-        if self._before is None or len(self._greys) < 2:
+        if self._before is None or len(self._images) < 2:
             return False
         self._take_back()
         self.follow(sight, guess(self))
@@ -258,9 +237,7 @@ class TrackTable:
         for name, values in self._before.items():
             setattr(self, name, values)
         self._before = None
-        self._greys.pop()
-        self._bands.pop()
-        self._frame_ids.pop()
+        self._images.drop_newest()
 
     def follow_jump(self, sight: Sight) -> bool:
         """Look again for what ``follow`` just looked for, by descriptors.
@@ -270,7 +247,7 @@ class TrackTable:
         Returns:
             Whether more was found.
         """
-        if self._before is None or self._jumped or len(self._greys) < 2:
+        if self._before is None or self._jumped or len(self._images) < 2:
             return False
         after = {name: getattr(self, name) for name in _COLUMNS}
         self._take_back()
@@ -301,10 +278,10 @@ class TrackTable:
         something near any guess.
         """
         rows = np.flatnonzero(self.missed == 0)
-        jump = self._search_jump(sight, self.xy[rows])
+        jump = self._images.search_jump(sight, self.xy[rows])
         if jump is None:
             return False
-        points = track_warped(self._greys[-1], sight.grey, self.xy[rows], jump.xy, jump.warps)
+        points = track_warped(self._images[0], sight.grey, self.xy[rows], jump.xy, jump.warps)
         refuted = np.linalg.norm(found.xy[rows] - jump.xy, axis=1) > MAX_FROM_GUESS_PX
         refuted |= points.ok & (np.linalg.norm(found.xy[rows] - points.xy, axis=1) > _REFUTED_PX)
         shown = points.ok & ~sight.near_lost(points.xy, _LOST_MARGIN_PX)
@@ -312,22 +289,6 @@ class TrackTable:
             return False
         found.take(rows, points)
         return True
-
-    def _search_jump(self, sight: Sight, xy: Array) -> Carried | None:
-        """Where points ``(N, 2)`` of the last image are now, by descriptors: finer ones where few match."""
-        grey = self._greys[-1]
-        jump = search_wide(self._features_of(grey), sight.wide_features, xy)
-        if jump is None or jump.num_matches >= _PLENTY_OF_MATCHES or not has_finer(grey):
-            return jump
-        now = WideFeatures.of(sight.grey, sight.usable_pixels, fine=True)
-        fine = search_wide(WideFeatures.of(grey, fine=True), now, xy)
-        return fine if fine is not None and fine.num_matches > jump.num_matches else jump
-
-    def _features_of(self, grey: Grey) -> WideFeatures:
-        """Features of an older image; where it is as it came, those found when it was the newest one do."""
-        as_it_came = (sight for sight in self._sights if sight.grey is grey and sight.usable.all())
-        known = next(as_it_came, None)
-        return WideFeatures.of(grey) if known is None else known.wide_features
 
     def _settle(self, sight: Sight, found: Found, coasting: NDArray[np.bool_]) -> None:
         """Move tracks to where they were found, and forget those that neither were nor coast."""
@@ -443,14 +404,11 @@ class TrackTable:
 
     def replace_newest(self, sight: Sight) -> None:
         """Take another version of the image that was taken last."""
-        self._greys[-1], self._bands[-1] = sight.grey, sight.band_power
+        self._images.replace_newest(sight)
 
     def remember(self, sight: Sight) -> None:
         """Keep the image for tracks that are looked for in later ones."""
-        self._greys = [*self._greys[-MAX_COAST:], sight.grey]
-        self._sights = [*self._sights[-1:], sight]
-        self._bands = [*self._bands[-MAX_COAST:], sight.band_power]
-        self._frame_ids = [*self._frame_ids[-MAX_COAST:], sight.frame.frame_id]
+        self._images.append(sight)
 
     def refill(self, sight: Sight) -> int:
         """Start new tracks where there are none; the number started.
