@@ -2,6 +2,7 @@
 
 Run
     loop          one process or several, on a CPU or a GPU, resumable
+    run           model, average and optimisers of a run, and its checkpoint
     settings      settings of a run
     optimisers    which weight is trained by which optimiser, and how fast
     muon          the Muon optimiser

@@ -8,6 +8,7 @@ import pytest
 
 from semcast.common.nets.transceiver import Sizes
 from semcast.evaluation import loss_ablation
+from semcast.training import run
 from semcast.training.data import CropSettings
 from semcast.training.settings import TrainSettings
 
@@ -33,13 +34,9 @@ def photos(tmp_path):
 
 def test_variants_switch_terms_and_are_graded(photos, monkeypatch):
     folder, images = photos
-    known = loss_ablation.train.__globals__["architecture"]
-    monkeypatch.setitem(
-        loss_ablation.train.__globals__,
-        "architecture",
-        lambda name: dataclasses.replace(known(name), sizes=TINY),
-    )
-    monkeypatch.setattr("semcast.training.loop._FOLD_BATCHES", 2)  # the many of a real run take longest here
+    known = run.architecture
+    monkeypatch.setattr(run, "architecture", lambda name: dataclasses.replace(known(name), sizes=TINY))
+    monkeypatch.setattr(run, "_FOLD_BATCHES", 2)  # the many of a real run take longest here
     settings = TrainSettings(
         data=folder, steps=4, batch=2, head_every=1, crop=CropSettings(size_px=64), threads=1
     )
