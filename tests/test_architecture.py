@@ -26,7 +26,10 @@ HOMES = {
     "mcap": {"common/recording_writer.py"},
     "matplotlib": {"evaluation/plots.py"},
     "poselib": {
-        *(f"server/geometry/{name}.py" for name in ("lo_ransac", "pnp", "ransac", "two_view", "wide_search")),
+        *(
+            f"server/geometry/{name}.py"
+            for name in ("lo_ransac", "pnp", "ransac", "two_view_candidates", "wide_search")
+        ),
         "server/mapping/planar_ambiguity.py",
     },
     "rosbags": {"agent/ros_bag.py"},

@@ -23,6 +23,8 @@ Points in images
 
 Two views
     two_view         relative pose from matches: searches, choice, refinement
+    two_view_candidates  what is searched for, and poses near pure turning and of a plane
+    two_view_refinement  the noise of a pair, and how much of the edges its errors have
     epipolar         residuals of a relative pose, cheirality, refinement
     agreement        how far each match moves like its neighbours
     lo_ransac        PoseLib's LO-RANSAC

@@ -10,20 +10,18 @@ an edge its errors count, are fitted to this pair's own residuals. A misleading 
 time, hardly accuracy.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import get_args
 
 import numpy as np
-import poselib
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.common.geometry import make_transform, project_to_so3, rotation_angle_deg
+from semcast.common.geometry import make_transform, rotation_angle_deg
 from semcast.common.shapes import check_shape
 from semcast.server.geometry.agreement import neighbour_agreement
 from semcast.server.geometry.epipolar import (
-    Shapes,
     depths,
     fit_rotation,
     fundamental_matrix,
@@ -31,25 +29,26 @@ from semcast.server.geometry.epipolar import (
     most_in_front,
     msac_score,
     rays_angle_deg,
-    refine_relative_pose,
     rotation_residual_px,
     sampson_px,
-    shape_of,
 )
-from semcast.server.geometry.lo_ransac import lo_ransac
-from semcast.server.geometry.ransac import confidence_ransac, in_front
-from semcast.server.geometry.weighting import ConfidenceMode, NoiseModel, fit_noise
+from semcast.server.geometry.ransac import confidence_ransac
+from semcast.server.geometry.two_view_candidates import (
+    MIN_MATCHES,
+    from_plane,
+    near_turning,
+    search,
+    searched,
+)
+from semcast.server.geometry.two_view_refinement import refine_to_own_noise, shapes_of_errors
+from semcast.server.geometry.weighting import ConfidenceMode
 
 Array = NDArray[np.float64]
 
-MIN_MATCHES = 8
-#: Thresholds of the searches and of the score, in units of the one that is asked for.
-_THRESHOLD_FACTORS = (1.0, 2.0)
+#: Thresholds of the score, in units of the one that is asked for.
 _SCORE_FACTORS = (0.5, 1.0, 2.0, 4.0)
 #: A match that fewer of its neighbours agree with is in the first search alone, not in the refinement.
 _MIN_AGREEMENT = 0.25
-#: Where more than this share of the matches agree, a search among these alone is the first one over again.
-_NEARLY_ALL = 0.9
 #: Agreement from which on the weight of a match in the score rises, and where it reaches 1.
 _AGREEMENT_RANGE = (0.1, 0.4)
 #: The weight below that.
@@ -61,25 +60,6 @@ _TURN_COST = 0.3
 _TO_DISPLACE = 1.001
 #: Confidences that differ by no more than this are all alike and give no order.
 _ALIKE = 1e-6
-#: Matches by which the motions near pure turning are sought, at most.
-_MAX_TURNING_MATCHES = 100
-#: Steps of each of those searches.
-_TURNING_STEPS = 6
-#: Points near the camera have larger errors and most of the information: the fitted beta overstates what
-#: confidence is worth, half of it does best.
-_BETA_SHARE = 0.5
-#: Standard deviations at which errors are cut off in the refinement,
-_CUT_SIGMAS = 2.5
-#: and the least that is believed of a pair, however well its matches fit.
-_MIN_SIGMA_PX = 0.1
-
-
-#: Shares of the edges that errors may have.
-_SHARES = (0.25, 0.5, 0.75, 1.0)
-#: Log-likelihood that a share must gain over none: what a parameter costs (Akaike).
-_SHARE_SURE = 1.0
-#: No match is known to lie nearer to its line than that.
-_LEAST_PX = 1e-6
 
 
 @dataclass(frozen=True)
@@ -148,20 +128,20 @@ def estimate_two_view(
     agreement = neighbour_agreement(xy0, xy1)
     kept = _kept(agreement)
     how = {"seed": seed, "max_iterations": max_iterations, "min_iterations": min_iterations}
-    candidates = _searched(camera, xy0, xy1, kept, confidence, threshold_px, how)
-    candidates += _near_turning(camera, xy0[kept], xy1[kept], threshold_px)
+    candidates = searched(camera, xy0, xy1, kept, confidence, threshold_px, how)
+    candidates += near_turning(camera, xy0[kept], xy1[kept], threshold_px)
     if choose_model:
-        candidates += _from_plane(camera, xy0, xy1, threshold_px, seed)
+        candidates += from_plane(camera, xy0, xy1, threshold_px, seed)
     T_found = _likeliest(camera, candidates, xy0, xy1, _weights(agreement), threshold_px)
     if T_found is None:
         return None
     trusted = None if confidence is None else confidence[kept]
     shapes = None
     if edges is not None:
-        shapes = _shapes(
+        shapes = shapes_of_errors(
             camera, T_found, xy0[kept], xy1[kept], (edges[0][kept], edges[1][kept]), threshold_px
         )
-    T = _refine(camera, T_found, xy0[kept], xy1[kept], shapes, trusted, threshold_px)
+    T = refine_to_own_noise(camera, T_found, xy0[kept], xy1[kept], shapes, trusted, threshold_px)
     return _result(camera, T, xy0, xy1, threshold_px, choose_model)
 
 
@@ -189,7 +169,7 @@ def search_closely(
         min_iterations: Hypotheses at least.
         max_iterations: Hypotheses at most.
     """
-    T = _search(
+    T = search(
         camera,
         xy0,
         xy1,
@@ -239,35 +219,6 @@ def _as_in_the_paper(
         return None
     near = _near_lines(camera, T, xy0, xy1, threshold_px)
     return most_in_front(camera, (T, make_transform(T[:3, :3], -T[:3, 3])), xy0[near], xy1[near])
-
-
-def _searched(
-    camera: Intrinsics,
-    xy0: Array,
-    xy1: Array,
-    kept: NDArray[np.intp],
-    confidence: Array | None,
-    threshold_px: float,
-    how: Mapping[str, int],
-) -> list[Array | None]:
-    """What the searches find, at two thresholds each."""
-    return [
-        _search(camera, xy0[rows], xy1[rows], factor * threshold_px, in_order=in_order, **how)
-        for factor in _THRESHOLD_FACTORS
-        for rows, in_order in _orders_of_drawing(len(xy0), kept, confidence)
-    ]
-
-
-def _orders_of_drawing(
-    count: int, kept: NDArray[np.intp], confidence: Array | None
-) -> list[tuple[NDArray[np.intp], bool]]:
-    """Matches of each search, and whether it draws the first of them first."""
-    orders: list[tuple[NDArray[np.intp], bool]] = [(np.arange(count), False)]
-    if len(kept) < _NEARLY_ALL * count:
-        orders.append((kept, False))
-    if confidence is not None:
-        orders.append((kept[np.argsort(-confidence[kept], kind="stable")], True))
-    return orders
 
 
 def _likeliest(
@@ -345,116 +296,6 @@ def _near_lines(
 ) -> NDArray[np.bool_]:
     """Which matches are within two thresholds of their epipolar lines, ``(N,)``."""
     return np.asarray(np.abs(sampson_px(fundamental_matrix(camera, T), xy0, xy1)) < 2.0 * threshold_px)
-
-
-def _search(
-    camera: Intrinsics,
-    xy0: Array,
-    xy1: Array,
-    threshold_px: float,
-    *,
-    in_order: bool,
-    seed: int,
-    max_iterations: int,
-    min_iterations: int,
-) -> Array | None:
-    """PoseLib's LO-RANSAC; in order, it draws the first matches first."""
-    options = {
-        "max_epipolar_error": threshold_px,
-        "success_prob": 0.9999,
-        "max_iterations": max_iterations,
-        "min_iterations": min_iterations,
-        "seed": seed,
-        "progressive_sampling": in_order,
-    }
-    found = lo_ransac(camera, xy0, xy1, options)
-    return None if found is None else make_transform(project_to_so3(found[:3, :3]), found[:3, 3])
-
-
-def _near_turning(camera: Intrinsics, xy0: Array, xy1: Array, threshold_px: float) -> list[Array]:
-    """Poses near the turn that explains the matches best, with a translation from each axis on, both ways."""
-    rows = np.linspace(0, len(xy0) - 1, min(len(xy0), _MAX_TURNING_MATCHES)).astype(np.intp)
-    xy0, xy1 = xy0[rows], xy1[rows]
-    R = fit_rotation(camera, xy0, xy1)
-    sigma_px = np.full(len(rows), 2.0 * threshold_px)
-    return [
-        refine_relative_pose(camera, make_transform(R, axis), xy0, xy1, sigma_px, iterations=_TURNING_STEPS)
-        for axis in (*np.eye(3), *-np.eye(3))
-    ]
-
-
-def _from_plane(
-    camera: Intrinsics, xy0: Array, xy1: Array, threshold_px: float, seed: int
-) -> list[Array | None]:
-    """Poses of the plane most matches lie on; none where no plane stands out."""
-    options = {"max_reproj_error": 2.0 * threshold_px, "max_iterations": 500, "seed": seed}
-    H, info = poselib.estimate_homography(xy0, xy1, options, {})
-    if info["num_inliers"] < max(MIN_MATCHES, 0.5 * len(xy0)) or not np.isfinite(H).all():
-        return []
-    on_plane = np.asarray(info["inliers"], dtype=bool)
-    K = camera.K
-    poses, _ = poselib.motion_from_homography(np.linalg.inv(K) @ np.asarray(H) @ K)
-    starts: list[Array] = []
-    for pose in poses:
-        t = np.asarray(pose.t, dtype=np.float64)
-        length = float(np.linalg.norm(t))
-        if not np.isfinite(length) or length < 1e-9 or not np.isfinite(pose.R).all():
-            continue
-        T = make_transform(project_to_so3(pose.R), t / length)
-        T = in_front(camera, T, xy0[on_plane], xy1[on_plane])
-        # Each pose comes twice, with the plane before and behind the camera.
-        if not any(np.allclose(T, other, atol=1e-6) for other in starts):
-            starts.append(T)
-    sigma_px = np.full(len(xy0), 0.5 * threshold_px)
-    return [refine_relative_pose(camera, T, xy0, xy1, sigma_px) for T in starts]
-
-
-def _shapes(
-    camera: Intrinsics, T: Array, xy0: Array, xy1: Array, edges: tuple[Array, Array], threshold_px: float
-) -> Shapes | None:
-    """Shapes of errors as far as the matches near a pose bear them out.
-
-    Where images tell a point across an edge only, its error has the shape of the structure tensor; where
-    descriptors or a blurred image place it, hardly any. Which share of the edges makes the distances to the
-    epipolar lines likeliest (Laplace) is asked of this pair, as its noise is. None where no share does.
-    """
-    F = fundamental_matrix(camera, T)
-    distance = np.abs(sampson_px(F, xy0, xy1))
-    near = distance < 3.0 * threshold_px
-    if int(near.sum()) < MIN_MATCHES:
-        return None
-    xy0, xy1, distance = xy0[near], xy1[near], distance[near] + _LEAST_PX
-    least, likeliest = float(len(distance) * np.log(distance.mean())) - _SHARE_SURE, None
-    for share in _SHARES:
-        shapes = shape_of(share * edges[0]), shape_of(share * edges[1])
-        shaped = np.abs(sampson_px(F, xy0, xy1, (shapes[0][near], shapes[1][near]))) + _LEAST_PX
-        cost = float(len(distance) * np.log(shaped.mean()) - np.log(shaped / distance).sum())
-        if cost < least:
-            least, likeliest = cost, shapes
-    return likeliest
-
-
-def _refine(
-    camera: Intrinsics,
-    T: Array,
-    xy0: Array,
-    xy1: Array,
-    shapes: Shapes | None,
-    confidence: Array | None,
-    threshold_px: float,
-) -> Array:
-    """Refine with the noise fitted to this pair; with equal weights where confidence tells nothing."""
-    residual = half_line_px(camera, T, xy0, xy1, shapes)
-    near = residual < 3.0 * threshold_px
-    if int(near.sum()) < MIN_MATCHES:
-        return T
-    sigma = np.ones(len(xy0))
-    model = fit_noise(confidence[near], residual[near]) if confidence is not None else None
-    if model is not None and confidence is not None:
-        sigma = NoiseModel(1.0, _BETA_SHARE * model.beta).sigma_px(confidence)
-    scale_px = float(np.median(residual[near] / sigma[near])) / 0.6745
-    sigma_px = max(scale_px, _MIN_SIGMA_PX) * sigma
-    return refine_relative_pose(camera, T, xy0, xy1, sigma_px, shapes=shapes, cut_sigmas=_CUT_SIGMAS)
 
 
 def _result(

@@ -18,7 +18,7 @@ from semcast.server.geometry.epipolar import (
     sampson_px,
     turn_in_doubt_deg,
 )
-from semcast.server.geometry.two_view import MIN_MATCHES
+from semcast.server.geometry.two_view_candidates import MIN_MATCHES
 from semcast.server.geometry.weighting import MAD_TO_SIGMA, ConfidenceMode, NoiseModel, fuse_confidence
 from semcast.server.mapping.ambiguity import Structure, decide
 from semcast.server.mapping.hypotheses import hypothesis_of, poses_in, problem_of

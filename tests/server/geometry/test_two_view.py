@@ -2,34 +2,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from two_view_matches import CAMERA, make_far_matches, make_matches
 
-from semcast.common.camera import Intrinsics
 from semcast.common.geometry import (
     angle_between_deg,
-    exp_so3,
     make_transform,
     rotation_angle_deg,
-    transform_points,
 )
 from semcast.server.geometry import two_view
-from semcast.server.geometry.epipolar import shape_of
 from semcast.server.geometry.two_view import estimate_two_view, follows
 
-CAMERA = Intrinsics(fx=500, fy=500, cx=320, cy=240, width=640, height=480)
 FAST = {"min_iterations": 100, "max_iterations": 1000}
-
-
-def make_matches(seed, num=200, outlier_share=0.3, noise_px=0.5, t=None, plane=False):
-    rng = np.random.default_rng(seed)
-    T = make_transform(exp_so3(rng.normal(0, 0.05, 3)), rng.normal(0, 1, 3) if t is None else t)
-    points = rng.uniform((-3, -2, 5), (3, 2, 12), (num, 3))
-    if plane:
-        points[:, 2] = 6 + 0.3 * points[:, 0]
-    xy0, xy1 = CAMERA.project(points), CAMERA.project(transform_points(T, points))
-    xy1 = xy1 + rng.normal(0, noise_px, xy1.shape)
-    is_outlier = rng.random(num) < outlier_share
-    xy1[is_outlier] += rng.uniform(-60, 60, (int(is_outlier.sum()), 2))
-    return T, xy0, xy1, is_outlier
 
 
 def errors_deg(found, T):
@@ -113,18 +96,6 @@ def test_a_plane_gives_a_pose_with_its_points_in_front(seed):
     assert direction < 15
 
 
-def make_far_matches(seed, outlier_share, noise_px):
-    """Thirty matches of points 10 to 30 baselines ahead, which a large turn explains nearly as well."""
-    rng = np.random.default_rng(seed)
-    T = make_transform(exp_so3(rng.normal(0, 0.02, 3)), (0.2, 0.05, 1.0))
-    points = rng.uniform((-4, -4, 10), (4, 4, 30), (30, 3))
-    xy0, xy1 = CAMERA.project(points), CAMERA.project(transform_points(T, points))
-    xy1 = xy1 + rng.normal(0, noise_px, xy1.shape)
-    is_outlier = rng.random(30) < outlier_share
-    xy1[is_outlier] += rng.uniform(-60, 60, (int(is_outlier.sum()), 2))
-    return T, xy0, xy1
-
-
 def test_turns_the_camera_never_made_are_rarer_where_turning_costs(monkeypatch):
     error_deg = {}
     for cost in (0.0, two_view._TURN_COST):
@@ -135,28 +106,6 @@ def test_turns_the_camera_never_made_are_rarer_where_turning_costs(monkeypatch):
             [errors_deg(f, T)[1] for f, (T, *_) in zip(found, matches, strict=True)]
         )
     assert error_deg[True] < 0.85 * error_deg[False]
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_a_motion_near_pure_turning_is_found_without_a_search(seed):
-    T, xy0, xy1 = make_far_matches(seed, 0.0, 0.2)
-    poses = two_view._near_turning(CAMERA, xy0, xy1, 1.0)
-    # The sign of the translation is chosen afterwards; the axis ahead alone would be 12 degrees off.
-    direction = [angle_between_deg(pose[:3, 3], T[:3, 3]) for pose in poses]
-    best = int(np.argmin([min(angle, 180 - angle) for angle in direction]))
-    assert min(direction[best], 180 - direction[best]) < 3.0
-    assert rotation_angle_deg(poses[best][:3, :3] @ T[:3, :3].T) < 0.2
-
-
-def test_a_plane_leads_to_the_true_pose_and_no_plane_to_none():
-    T, xy0, xy1, _ = make_matches(0, t=(0.8, 0.1, 0.1), plane=True, outlier_share=0.0, noise_px=0.0)
-    errors = [
-        rotation_angle_deg(pose[:3, :3] @ T[:3, :3].T) + angle_between_deg(pose[:3, 3], T[:3, 3])
-        for pose in two_view._from_plane(CAMERA, xy0, xy1, 1.0, 0)
-    ]
-    assert min(errors) < 0.01
-    _, xy0, xy1, _ = make_matches(0, t=(3.0, 0.1, 0.1))
-    assert two_view._from_plane(CAMERA, xy0, xy1, 1.0, 0) == []
 
 
 def test_matches_without_like_neighbours_are_left_out_unless_too_few_remain():
@@ -205,36 +154,6 @@ def test_confidence_that_is_off_or_all_alike_is_none(mode, spread):
     assert np.array_equal(a.T_cam1_cam0, b.T_cam1_cam0)
 
 
-@pytest.mark.parametrize(
-    ("slide_px", "least", "most"), [(0.1, None, None), (0.35, 0.25, 0.75), (1.0, 0.75, 1.0)]
-)
-def test_errors_have_as_much_of_their_edges_as_the_distances_bear_out(slide_px, least, most):
-    # Across an edge errors are .1 px; edges say that along it they are ten times as large.
-    rng = np.random.default_rng(0)
-    T, xy0, xy1, _ = make_matches(0, num=300, noise_px=0.0, outlier_share=0.0)
-    angle = rng.uniform(0, np.pi, 300)
-    along = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    across = np.stack([-along[:, 1], along[:, 0]], axis=1)
-    xy1 = xy1 + rng.normal(0, slide_px, (300, 1)) * along + rng.normal(0, 0.1, (300, 1)) * across
-    xy0 = xy0 + rng.normal(0, slide_px, (300, 1)) * along + rng.normal(0, 0.1, (300, 1)) * across
-    edge = 0.5 * np.log(10.0) * along
-    shapes = two_view._shapes(CAMERA, T, xy0, xy1, (edge, edge), 2.0)
-    if least is None or most is None:
-        assert shapes is None
-        return
-    assert shapes is not None
-    expected = [share for share in (0.25, 0.5, 0.75, 1.0) if np.allclose(shapes[0], shape_of(share * edge))]
-    assert len(expected) == 1
-    assert least <= expected[0] <= most
-    assert np.array_equal(shapes[1], shapes[0])
-
-
-def test_shapes_of_too_few_matches_near_a_pose_are_none():
-    T, xy0, xy1, _ = make_matches(0, num=20, noise_px=0.0, outlier_share=0.0)
-    edge = np.tile([0.5, 0.5], (20, 1))
-    assert two_view._shapes(CAMERA, T, xy0[:7], xy1[:7], (edge[:7], edge[:7]), 1.0) is None
-
-
 def test_edges_that_matches_slid_along_take_errors_off_but_not_in_the_paper():
     errors = {"known": [], "unknown": []}
     for seed in range(8):
@@ -250,17 +169,6 @@ def test_edges_that_matches_slid_along_take_errors_off_but_not_in_the_paper():
     told = {"confidence": np.where(is_outlier, 0.3, 0.9), "mode": "paper"}
     a, b = (estimate_two_view(CAMERA, xy0, xy1, edges=e, **told) for e in (edges, None))
     assert np.array_equal(a.T_cam1_cam0, b.T_cam1_cam0)
-
-
-def test_matches_are_drawn_from_all_from_those_that_agree_and_in_order_of_confidence():
-    kept = np.array([0, 2, 3])
-    every, among, ordered = two_view._orders_of_drawing(4, kept, np.array([0.1, 1.0, 0.5, 0.9]))
-    assert (every[0].tolist(), every[1]) == ([0, 1, 2, 3], False)
-    assert (among[0].tolist(), among[1]) == ([0, 2, 3], False)
-    assert (ordered[0].tolist(), ordered[1]) == ([3, 2, 0], True)
-    # Nine of ten are nearly all: a search among these would be the first one over again.
-    assert len(two_view._orders_of_drawing(10, np.arange(9), None)) == 1
-    assert len(two_view._orders_of_drawing(11, np.arange(9), None)) == 2
 
 
 def test_the_same_seed_gives_the_same_result():
