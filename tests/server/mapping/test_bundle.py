@@ -1,65 +1,16 @@
-import os
-import signal
 from dataclasses import replace
-from itertools import pairwise
 
-import gtsam
 import numpy as np
 import pytest
-from gtsam.symbol_shorthand import X
+from small_windows import CAMERA, make_problem, pose_error
 
-from semcast.common.camera import Intrinsics
-from semcast.common.geometry import exp_se3, exp_so3, invert_transform, make_transform, transform_points
+from semcast.common.geometry import invert_transform, transform_points
 from semcast.server.geometry.edges import alike, rounded
 from semcast.server.geometry.projection import project_with_jacobian
 from semcast.server.mapping import bundle, dense_bundle
-from semcast.server.mapping import window_covariance as covariance_of_window
-from semcast.server.mapping.bundle import InlineBundle, optimise, quantised_sigma, residuals_px
+from semcast.server.mapping.bundle import optimise, quantised_sigma, residuals_px
 from semcast.server.mapping.bundle_problem import BundleProblem
-from semcast.server.mapping.bundle_process import ProcessBundle
 from semcast.server.mapping.pose_graph import PoseConstraint
-
-CAMERA = Intrinsics(fx=500.0, fy=480.0, cx=320.0, cy=240.0, width=640, height=480)
-
-
-def make_problem(seed=0, num_views=6, num_points=60, noise_px=0.3, shake=0.02, sigma_px=None, **changes):
-    """A window with known truth whose start is shaken; the two oldest poses are exact and fixed."""
-    rng = np.random.default_rng(seed)
-    T_world_cam = np.stack(
-        [
-            make_transform(exp_so3(rng.normal(0, 0.03, 3)), (0.4 * k, 0.1 * rng.normal(), 0.1 * k))
-            for k in range(num_views)
-        ]
-    )
-    xyz = rng.uniform((-2, -1.5, 5), (4, 1.5, 12), (num_points, 3))
-    view, point = (a.ravel() for a in np.meshgrid(np.arange(num_views), np.arange(num_points), indexing="ij"))
-    cam = np.stack([transform_points(invert_transform(T), xyz) for T in T_world_cam]).reshape(-1, 3)
-    xy = CAMERA.project(cam)
-    sigma = np.full(len(xy), noise_px) if sigma_px is None else sigma_px(view, point, rng)
-    xy = xy + rng.normal(0, 1, xy.shape) * sigma[:, None]
-    start = np.stack(
-        [T if k < 2 else T @ exp_se3(rng.normal(0, shake, 6)) for k, T in enumerate(T_world_cam)]
-    )
-    values = {
-        "camera": CAMERA,
-        "keyframe_ids": np.arange(num_views),
-        "T_world_cam": start,
-        "fixed": np.arange(num_views) < 2,
-        "keep_baseline": False,
-        "landmark_ids": np.arange(num_points),
-        "xyz": xyz + rng.normal(0, shake, xyz.shape),
-        "view": view,
-        "point": point,
-        "xy": xy,
-        "sigma_px": np.maximum(sigma, 0.1),
-        "confidence": np.ones(len(xy)),
-        "iterations": 12,
-    }
-    return BundleProblem(**{**values, **changes}), T_world_cam, xyz
-
-
-def pose_error(result, truth):
-    return np.linalg.norm(result.T_world_cam[:, :3, 3] - truth[:, :3, 3], axis=1).max()
 
 
 def test_an_exact_window_is_recovered():
@@ -247,71 +198,6 @@ def both_ways(problem):
     return optimise(problem), optimise(replace(problem, solver="gtsam"))
 
 
-def with_outliers(problem):
-    xy = problem.xy.copy()
-    xy[::9] += (30.0, -20.0)
-    return {"xy": xy}
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [
-        lambda problem: {},
-        lambda problem: {"iterations": 1},
-        with_outliers,
-        lambda problem: {**with_outliers(problem), "huber_px": 1.0},
-        lambda problem: {"edge": np.random.default_rng(3).normal(0, 0.6, problem.xy.shape)},
-        lambda problem: {"fixed": np.arange(6) == 0, "keep_baseline": True},
-        lambda problem: {"fixed": np.arange(6) == 3, "keep_baseline": True},
-        lambda problem: {"view": problem.view[::-1], "point": problem.point[::-1], "xy": problem.xy[::-1]},
-        lambda problem: (
-            {name: np.repeat(vars(problem)[name], 2, axis=0) for name in ("view", "point", "xy", "edge")}
-            | {name: np.repeat(vars(problem)[name], 2) for name in ("sigma_px", "confidence")}
-        ),
-    ],
-    ids=[
-        "window",
-        "a step",
-        "outliers",
-        "Eq. 22",
-        "edges",
-        "baseline",
-        "baseline from the middle",
-        "any order",
-        "seen twice",
-    ],
-)
-def test_dense_algebra_ends_where_gtsam_does(changes, monkeypatch):
-    # The information alone, as GTSAM's marginals.
-    monkeypatch.setattr(covariance_of_window, "_MIN_GROUPS", 99)
-    problem, _, _ = make_problem(num_points=40, shake=0.05)
-    dense, sparse = both_ways(BundleProblem(**{**vars(problem), **changes(problem)}))
-    assert dense.ok
-    assert sparse.ok
-    assert np.abs(sparse.T_world_cam - problem.T_world_cam).max() > 0.01
-    np.testing.assert_allclose(dense.T_world_cam, sparse.T_world_cam, atol=2e-6)
-    np.testing.assert_allclose(dense.xyz, sparse.xyz, atol=2e-5)
-    ended = replace(sparse.problem, T_world_cam=sparse.T_world_cam, xyz=sparse.xyz)
-    marginals = gtsam.Marginals(*bundle._build(ended, np.ones(len(ended.xy), bool)))
-    for k in np.flatnonzero(~ended.fixed).tolist():
-        expected = marginals.marginalCovariance(X(k))
-        scale = np.sqrt(np.diag(expected))
-        difference = (dense.covariances[k, :6, :6] - expected) / np.outer(scale, scale)
-        assert np.abs(difference).max() < 1e-3
-
-
-def test_a_step_that_would_make_it_worse_is_shortened_as_gtsam_does(monkeypatch):
-    problem, _, _ = make_problem(num_views=4, num_points=4, shake=0.4, seed=5)
-    tried = []
-    step = dense_bundle.Normal.step
-    monkeypatch.setattr(
-        dense_bundle.Normal, "step", lambda self, damping: tried.append(damping) or step(self, damping)
-    )
-    dense, sparse = both_ways(problem)
-    assert any(later > before for before, later in pairwise(tried)), "nothing was shortened"
-    np.testing.assert_allclose(dense.T_world_cam, sparse.T_world_cam, atol=1e-5)
-
-
 @pytest.mark.parametrize("fixed_last", [True, False], ids=["held", "unseen"])
 def test_a_last_pose_that_is_held_or_unseen_has_no_covariance(fixed_last):
     problem, T_world_cam, _ = make_problem(noise_px=0.1)
@@ -423,56 +309,6 @@ def test_the_weight_is_outside_of_the_loss_in_the_papers_objective_and_inside_in
         graph, values = bundle._build(asked, used)
         window, state, _ = bundle._window_of(asked, used)
         assert dense_bundle.see(window, state).cost == pytest.approx(graph.error(values))
-
-
-def test_inline_gives_the_same_bits_again():
-    results = []
-    for _ in range(2):
-        runner = InlineBundle()
-        assert runner.submit(make_problem()[0])
-        assert runner.busy
-        assert not runner.submit(make_problem()[0])
-        results.append(runner.take())
-        assert runner.take() is None
-    assert np.array_equal(results[0].T_world_cam, results[1].T_world_cam)
-    assert np.array_equal(results[0].xyz, results[1].xyz)
-
-
-def test_the_process_gives_what_inline_gives_and_survives_a_kill():
-    problem, _, _ = make_problem()
-    inline = optimise(problem)
-    runner = ProcessBundle(lossless=True)
-    try:
-        assert runner.submit(problem)
-        result = runner.take()
-        assert result is not None
-        assert np.array_equal(result.T_world_cam, inline.T_world_cam)
-        before = runner.pid
-        os.kill(before, signal.SIGKILL)
-        assert runner.submit(problem) or runner.submit(problem)
-        result = runner.take()
-        assert result is not None
-        assert np.array_equal(result.xyz, inline.xyz)
-        assert runner.pid != before
-    finally:
-        runner.close()
-        runner.close()
-    assert not runner.submit(problem)
-    assert runner.take() is None
-
-
-def test_live_process_never_waits_unless_asked():
-    runner = ProcessBundle()
-    try:
-        assert runner.take() is None
-        assert runner.submit(make_problem()[0])
-        assert runner.busy
-        result = runner.take() or runner.take(wait=True)
-        assert result is not None
-        assert result.ok
-        assert not runner.busy
-    finally:
-        runner.close()
 
 
 def test_a_window_of_points_that_slid_along_edges():
