@@ -1,4 +1,4 @@
-"""A small exact run: cameras on an arc that look at random points, observations without error."""
+"""Fixtures of the server's tests: a small exact run, and a recording."""
 
 import numpy as np
 import pytest
@@ -85,3 +85,25 @@ def write_arc_run():
 def read_ply():
     """Reads a map; see ``read_ply_from``."""
     return read_ply_from
+
+
+@pytest.fixture(scope="session")
+def recording(tmp_path_factory):
+    """The demo's first frames as they were sent and arrived."""
+    from recorded_demo import record_demo
+
+    path = tmp_path_factory.mktemp("recording") / "run.mcap"
+    record_demo(path)
+    return path
+
+
+@pytest.fixture(scope="session")
+def whole(recording):
+    """Summary of a replay of all of the recording, and its frames in the order they were processed."""
+    from recorded_demo import without_depth
+
+    from semcast.server.replay import replay
+
+    seen = []
+    summary = replay(without_depth(recording), None, seen.append)
+    return summary, tuple(seen)

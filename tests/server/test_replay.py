@@ -1,98 +1,33 @@
 """A recording replays to the same poses every time; through another channel it does not."""
 
-import contextlib
 import itertools
 import json
-import re
 import threading
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from recorded_demo import FRAMES, SEQUENCE, without_depth
 
-from semcast.agent.agent import run_agent
-from semcast.agent.settings import AgentSettings
-from semcast.agent.source_settings import SourceSettings
-from semcast.channel.emulator import run_channel
-from semcast.channel.emulator_settings import EmulatorSettings
 from semcast.channel.settings import ChannelSettings
 from semcast.cli import main
 from semcast.common.codecs import load_codec
 from semcast.common.config import build_settings, read_toml
 from semcast.common.errors import ConfigError, SemcastError, SourceError
-from semcast.common.loopback import open_hub
-from semcast.common.messages import CameraInfo, SymbolFrame
-from semcast.common.metrics import Metrics
-from semcast.common.network_settings import NetworkSettings
+from semcast.common.messages import CameraInfo
 from semcast.common.recorded_streams import recorded_streams
 from semcast.common.recorder import Recorder
 from semcast.common.recording_reader import RecordingReader
-from semcast.common.recording_writer import RecordingWriter, recording_metadata, recover_file
+from semcast.common.recording_writer import recording_metadata
 from semcast.common.run_folder import read_run
 from semcast.common.sequence import open_sequence
 from semcast.common.wire import pack, unpack
-from semcast.describe import describe_recording
 from semcast.server.marker_settings import MarkerSettings
-from semcast.server.receiver import Receiver
-from semcast.server.record import RecordSettings, StreamNotes, kind_of_key, run_record
+from semcast.server.record import StreamNotes, kind_of_key
 from semcast.server.replay import ReplaySettings, replay
 from semcast.server.session import Session
 from semcast.server.view.settings import ViewSettings
-
-SEQUENCE = Path(__file__).resolve().parents[2] / "deploy" / "demo" / "kitti_06"
-FRAMES = 10
-
-
-@pytest.fixture(scope="module")
-def recording(tmp_path_factory):
-    """A stream recorded beside a running agent and channel, of which a slow machine loses nothing either."""
-    path = tmp_path_factory.mktemp("recording") / "run.mcap"
-    hub, endpoint = open_hub()
-    network = NetworkSettings(connect=(endpoint,))
-    stop = threading.Event()
-    radio = EmulatorSettings(network=network, link=ChannelSettings(snr_db=15.0))
-    others = [
-        threading.Thread(target=run_channel, args=(radio, stop)),
-        threading.Thread(target=run_record, args=(RecordSettings(file=path, network=network), stop)),
-    ]
-    for thread in others:
-        thread.start()
-    source = SourceSettings(source=str(SEQUENCE), resize=0.4, max_frames=FRAMES, pace="receiver")
-    agent = AgentSettings(
-        source=source, mode="replay", codec="jpeg-ldpc", share_source="png", network=network
-    )
-    with contextlib.closing(Receiver(hub, "agent0", "replay", Metrics("server"))) as receiver:
-        hub.declare_alive("agent0", "server")
-        sender = threading.Thread(target=run_agent, args=(agent, stop))
-        sender.start()
-        end_s = time.monotonic() + 60.0
-        is_last = False
-        while not is_last:
-            assert time.monotonic() < end_s
-            if (frame := receiver.next(0.05)) is not None:
-                receiver.done(frame.message)
-                is_last = frame.message.final
-        sender.join(20)
-    stop.set()
-    for thread in others:
-        thread.join(20)
-    hub.close()
-    return path
-
-
-def without_depth(file, **changes):
-    """Settings of a replay that leaves out depth, which takes longer than all else of it."""
-    return ReplaySettings(file=file, dense_cloud="none", **changes)
-
-
-@pytest.fixture(scope="module")
-def whole(recording):
-    """Summary of a replay of all of the recording, and its frames in the order they were processed."""
-    seen = []
-    summary = replay(without_depth(recording), None, seen.append)
-    return summary, tuple(seen)
 
 
 def test_a_key_tells_the_kind_of_its_messages():
@@ -304,130 +239,6 @@ def test_a_channel_means_the_transmitted_symbols(recording):
         ReplaySettings(file=recording, pace=-1.0)
 
 
-def test_a_cut_recording_is_recovered_and_still_replays(recording, tmp_path, capsys):
-    cut = tmp_path / "cut.mcap"
-    data = recording.read_bytes()
-    cut.write_bytes(data[: len(data) * 3 // 4])
-    info = recover_file(cut, tmp_path / "whole.mcap")
-    assert not info.complete
-    assert main(["recover", str(cut), "--out", str(tmp_path / "again.mcap")]) == 0
-    assert capsys.readouterr().out.endswith(f"messages; {cut} was cut off\n")
-    holed = tmp_path / "holed.mcap"
-    holed.write_bytes(data[: len(data) // 2] + bytes(1000) + data[len(data) // 2 + 1000 :])
-    assert main(["recover", str(holed), "--out", str(tmp_path / "again.mcap")]) == 0
-    assert capsys.readouterr().out.endswith(f"messages; {holed} was damaged: 1 chunk left out\n")
-    assert RecordingReader(tmp_path / "whole.mcap").info().complete
-    assert replay(without_depth(tmp_path / "whole.mcap"))["frames"]
-
-
-@pytest.fixture
-def with_a_later_start(recording, tmp_path):
-    """The recording, then the camera of another start of the agent, which never sent a frame."""
-    path = tmp_path / "two.mcap"
-    messages = list(RecordingReader(recording).messages())
-    camera = unpack(next(m.data for m in messages if m.kind == "camera"), CameraInfo)
-    later = replace(camera, agent_epoch=camera.agent_epoch + 10**9)
-    with path.open("wb") as stream:
-        writer = RecordingWriter(stream, recording_metadata("", "0"))
-        for m in messages:
-            writer.add(m.topic, m.kind, m.log_time_ns, m.sequence, m.data)
-        writer.add("semcast/agent0/camera", "camera", messages[-1].log_time_ns, 99, pack(later))
-        writer.finish()
-    return path
-
-
-def test_a_start_without_frames_does_not_hide_the_one_before(recording, with_a_later_start, tmp_path):
-    with_frames, without = recorded_streams(RecordingReader(with_a_later_start))
-    assert (with_frames.num_received, with_frames.num_transmitted) == (FRAMES, FRAMES)
-    assert (without.num_received, without.num_transmitted) == (0, 0)
-    assert without.camera.agent_epoch == with_frames.camera.agent_epoch + 10**9
-    for name, path in (("alone", recording), ("both", with_a_later_start)):
-        replay(without_depth(path, out=tmp_path / name, end_s=0.6))
-    first, second = ((tmp_path / name / "trajectory.tum").read_bytes() for name in ("alone", "both"))
-    assert first == second
-
-
-def test_topics_that_another_tool_renamed_are_no_streams(recording, tmp_path):
-    path = tmp_path / "renamed.mcap"
-    with path.open("wb") as stream:
-        writer = RecordingWriter(stream, recording_metadata("", "0"))
-        for k, m in enumerate(RecordingReader(recording).messages(frozenset({"camera", "symbols"}))):
-            writer.add("camera" if k % 2 else "/front camera/camera", m.kind, m.log_time_ns, 0, m.data)
-        writer.finish()
-    with pytest.raises(SourceError, match="says nothing about a camera"):
-        replay(without_depth(path))
-    assert kind_of_key("semcast/agent0") == ""
-
-
-def test_a_frame_that_was_sent_again_counts_once(recording, tmp_path):
-    path = tmp_path / "again.mcap"
-    messages = list(RecordingReader(recording).messages())
-    messages += [m for m in messages if m.kind == "symbols"][-2:]
-    with path.open("wb") as stream:
-        writer = RecordingWriter(stream, recording_metadata("", "0"))
-        for m in messages:
-            writer.add(m.topic, m.kind, m.log_time_ns, m.sequence, m.data)
-        writer.finish()
-    assert recorded_streams(RecordingReader(path)) == recorded_streams(RecordingReader(recording))
-
-
-def with_changed_frame(recording, path, sequence, change):
-    """Write a recording again with one received frame's message changed."""
-    num_changed = 0
-    with path.open("wb") as stream:
-        writer = RecordingWriter(stream, recording_metadata("", "0"))
-        for m in RecordingReader(recording).messages():
-            is_hit = m.topic.endswith("rx/symbols") and m.sequence == sequence
-            num_changed += is_hit
-            writer.add(m.topic, m.kind, m.log_time_ns, m.sequence, change(m.data) if is_hit else m.data)
-        writer.finish()
-    assert num_changed == 1
-    return path
-
-
-def test_a_forged_frame_id_costs_its_frame_alone(recording, tmp_path, caplog):
-    def forge(data):
-        return pack(replace(unpack(data, SymbolFrame), frame_id=2**62, t_source_ns=2**62))
-
-    path = with_changed_frame(recording, tmp_path / "forged.mcap", 0, forge)
-    frames = [[], []]
-    for seen, file in zip(frames, (recording, path), strict=True):
-        replay(without_depth(file, end_s=0.6), None, seen.append)
-    assert set(frames[0]) - set(frames[1]) == {frames[0][0]}
-    assert f"frame {2**62} is left out" in caplog.text
-
-
-def test_an_unreadable_message_costs_its_frame_alone(recording, whole, tmp_path, caplog):
-    path = with_changed_frame(recording, tmp_path / "damaged.mcap", 2, lambda data: data[:-9])
-    seen = []
-    replay(without_depth(path), None, seen.append)
-    assert len(set(whole[1]) - set(seen)) == 1
-    assert "a message of semcast/agent0/rx/symbols" in caplog.text
-
-
-def test_an_unreadable_message_of_another_agent_is_not_told(recording, tmp_path, caplog):
-    path = tmp_path / "two.mcap"
-    with path.open("wb") as stream:
-        writer = RecordingWriter(stream, recording_metadata("", "0"))
-        writer.add("semcast/right/rx/symbols", "symbols", 1, 0, b"junk")
-        for m in RecordingReader(recording).messages():
-            writer.add(m.topic, m.kind, m.log_time_ns, m.sequence, m.data)
-        writer.finish()
-    replay(without_depth(path, end_s=0.3))
-    assert "is left out" not in caplog.text
-
-
-def test_a_frame_of_another_codec_costs_itself_alone(recording, whole, tmp_path, caplog):
-    def of_another(data):
-        return pack(replace(unpack(data, SymbolFrame), digest="0123"))
-
-    path = with_changed_frame(recording, tmp_path / "mixed.mcap", 2, of_another)
-    mixed = replay(without_depth(path))
-    assert mixed["drops"] == {**whole[0]["drops"], "codec": 1}
-    assert mixed["frames"]["tracked"] == whole[0]["frames"]["tracked"] - 1
-    assert "is left out" in caplog.text
-
-
 def test_a_frame_that_can_not_be_tracked_costs_itself_alone(recording, whole, tmp_path, caplog, monkeypatch):
     process, count = Session.process, itertools.count()
 
@@ -442,22 +253,6 @@ def test_a_frame_that_can_not_be_tracked_costs_itself_alone(recording, whole, tm
     assert other["frames"]["tracked"] == whole[0]["frames"]["tracked"] - 1
     assert (tmp_path / "run" / "summary.json").is_file()
     assert "could not be tracked and is left out" in caplog.text
-
-
-def test_a_stream_is_chosen_by_its_number(with_a_later_start):
-    with pytest.raises(SourceError, match=r"no received frames of stream 2 \(stream 1: \d+, stream 2: 0\)"):
-        replay(without_depth(with_a_later_start, stream=2))
-    with pytest.raises(SourceError, match=r"stream must be in \[1, 2\] for .*two.mcap, got 3"):
-        replay(without_depth(with_a_later_start, stream=3))
-    assert replay(without_depth(with_a_later_start, stream=1, end_s=0.6))["frames"]
-
-
-def test_info_lists_the_streams_of_a_recording(with_a_later_start):
-    sections = dict(describe_recording(with_a_later_start))
-    (first, told), (second, told_of_second) = sections["streams"]
-    assert (first, second) == ("--stream 1", "--stream 2")
-    assert re.search(r"agent0, jpeg-ldpc, begun .* UTC: \d+ frames sent, \d+ received", told)
-    assert told_of_second.endswith("0 frames sent, 0 received")
 
 
 def test_a_time_range_without_frames_is_one_clear_error(recording, tmp_path):
