@@ -1,4 +1,4 @@
-"""Fixtures of the server's tests: a small exact run, and a recording."""
+"""Fixtures of the server's tests: a small exact run, a recording, and receivers on a hub."""
 
 import numpy as np
 import pytest
@@ -107,3 +107,35 @@ def whole(recording):
     seen = []
     summary = replay(without_depth(recording), None, seen.append)
     return summary, tuple(seen)
+
+
+@pytest.fixture(scope="session")
+def sent():
+    """Symbols of a frame, and how they are received."""
+    from receiver_ends import sent_and_received
+
+    return sent_and_received()
+
+
+@pytest.fixture
+def make_frame(sent):
+    """Makes frames as they are received; see ``frame_maker``."""
+    from receiver_ends import frame_maker
+
+    return frame_maker(sent[1])
+
+
+@pytest.fixture
+def ends():
+    """Opens receivers, each with a client of its own; see ``Ends``."""
+    from receiver_ends import Ends
+
+    opened = []
+
+    def open_ends(mode="live", **changes):
+        opened.append(Ends(mode, **changes))
+        return opened[-1]
+
+    yield open_ends
+    for one in opened:
+        one.close()
