@@ -31,6 +31,7 @@ Pose of a frame
     recall            lost landmarks, looked for again where the pose expects them
 
 Start of a map
+    beginning         frames without a pose are kept, and become a part of the map
     initialiser       two views with parallax, the frames between them, and an adjustment
     scene_motion      whether a relative pose is that of the scene or of a large moving thing
     start_geometry    frames between two views of known motion, and points of them all

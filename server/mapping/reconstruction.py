@@ -9,14 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
+from semcast.server.mapping.beginning import Beginning
 from semcast.server.mapping.blank import result_of_nothing, shows_nothing
 from semcast.server.mapping.bundle_problem import BundleRunner
 from semcast.server.mapping.camera_motion import CameraMotion
-from semcast.server.mapping.initialiser import Initialiser
-from semcast.server.mapping.kept_frames import backfill, observed_of
 from semcast.server.mapping.keyframe_rule import wants_keyframe
 from semcast.server.mapping.locator import RECOGNISED_CONFIDENCE, Locator
-from semcast.server.mapping.look_back import look_back
 from semcast.server.mapping.map_arrays import RunState
 from semcast.server.mapping.map_builder import MapBuilder
 from semcast.server.mapping.map_update import update_of
@@ -38,8 +36,6 @@ logger = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
 
-#: A frame with fewer rows than this share is kept for its pose, not to start a map from.
-_MIN_USABLE_SHARE = 0.5
 #: Keyframes between two attempts to recognise an older submap.
 _JOIN_INTERVAL = 3
 #: Share of the landmarks in sight that must agree with a pose found without a prior.
@@ -71,10 +67,10 @@ class Reconstruction:
     def _begin(self, camera: Intrinsics) -> None:
         s = self._settings
         self._tracks = TrackTable(s.confidence, s.max_features, s.seed, turntable=s.turntable)
-        self._initialiser = Initialiser(self._camera, s.confidence, s.min_parallax_deg, s.seed)
         self._motion = CameraMotion(self._camera)
         self._locator = Locator(self._camera, s, self._map, self._tracks, self._motion)
         self._placement = SubmapPlacement(self._camera, self._map.enough)
+        self._beginning = Beginning(self._camera, s, self._map, self._tracks, self._motion, self._placement)
         self._scale = ScaleWatch(self._camera)
         self._shutter = RollingShutter(camera, lambda: self._map.watch.is_on)
         self._outage = Outage()
@@ -147,7 +143,7 @@ class Reconstruction:
         self._locator.follow(sight, T_world_guess if is_tracked else None)
         sight, is_first = self._shutter.settle(frame, sight, self._tracks)
         if is_first:
-            self._initialiser.clear()
+            self._beginning.clear()
         self._lap("track", since)
         result = self._track(sight, T_world_guess) if is_tracked else self._find(sight)
         self._placement.note(sight, result.T_world_cam, self._motion, self._map.world)
@@ -192,7 +188,7 @@ class Reconstruction:
             return self._accept(sight, pose)
         logger.debug("frame %d: tracking is lost", sight.frame.frame_id)
         self._state, self._lost_ns = TrackingState.LOST, []
-        self._initialiser.clear()
+        self._beginning.clear()
         return self._find(sight)
 
     def _accept(self, sight: Sight, pose: TrackedPose) -> FrameResult:
@@ -300,31 +296,13 @@ class Reconstruction:
             logger.info("frame %d: a new map is begun, the old one is not in sight", frame.frame_id)
             self._state = TrackingState.INITIALIZING
             self._map.world.forget_frames(self._motion.give_up())
-            self._begin_submap()
+            self._beginning.begin_submap()
 
     def _look_for_start(self, sight: Sight) -> Start | None:
-        """Keep a frame without a pose for the start of a map, and try to start one with it."""
-        since, tracks = time.perf_counter_ns(), self._tracks
-        tracks.refill(sight)
-        # Tracks of old landmarks serve to find back, not to start anew: a landmark has one id.
-        visible = tracks.visible & (self._map.world.landmarks.rows(tracks.ids) < 0)
-        observed = observed_of(sight, tracks, visible)
-        self._initialiser.leave_out(tracks.ids[tracks.fixed])
-        waits = self._state is TrackingState.LOST or tracks.passing.camera_stands
-        waits |= float(sight.usable.mean()) < _MIN_USABLE_SHARE
-        noise, suspect = self._map.noise.model, tracks.ids[tracks.suspect]
-        start = self._initialiser.add(observed, noise, suspect, waits=waits)
+        since = time.perf_counter_ns()
+        start = self._beginning.look(sight, is_lost=self._state is TrackingState.LOST)
         self._lap("two_view", since)
         return start
-
-    def _begin_submap(self) -> None:
-        """Let the next start be a part of its own that shares no track with what came before.
-
-        Keyframes hold tracks without a landmark too: if one got its landmark in the new part, the old part
-        would be recognised by it, wherever the camera is.
-        """
-        self._map.begin_submap()
-        self._initialiser.renew(*self._tracks.renew(self._initialiser.ids))
 
     def _recover(self, sight: Sight) -> TrackedPose | None:
         """Pose of a frame after tracking was lost: by tracks that are still alive, else by recognition."""
@@ -354,7 +332,7 @@ class Reconstruction:
                 self._motion.reset()
             self._map.go_on_from(place)
             self._tracks.adopt(place.ids, place.xy, RECOGNISED_CONFIDENCE)
-            self._initialiser.clear()
+            self._beginning.clear()
         return pose
 
     def _settle(self, submap: int, sight: Sight, T_world_cam: Array, older: int) -> None:
@@ -370,18 +348,10 @@ class Reconstruction:
     def _begin_map(self, sight: Sight, start: Start) -> FrameResult:
         """Bring a start into the map and pose the frames that waited for it."""
         since = time.perf_counter_ns()
-        history = self._initialiser.history
-        self._map.finish()  # a new part is placed by where the old one ends
-        grown = look_back(self._camera, start, history, self._map.noise.model, self._settings)
-        place = self._placement.place(self._motion, start, grown, self._map.world, self._map.submap)
-        self._map.take_start(grown, sight, self._tracks, place, history)
-        noise, seed = self._map.noise.model, self._settings.seed
-        backfilled = backfill(self._camera, self._map.world, grown.keyframes, history[:-1], noise, seed)
-        self._motion.reset()
+        ids, backfilled = self._beginning.bring_in(sight, start)
         for posed in backfilled:
-            self._moves_to(*posed, grown.ids)
+            self._moves_to(*posed, ids)
         backfilled = tuple(posed for posed in backfilled if posed[0] in self._map.world.frames)
-        self._initialiser.clear()
         self._frames_since_keyframe = 0
         self._lap("two_view", since)
         newest, seen = self._map.world.pose_of_frame(sight.frame.frame_id), self._tracks.seen()
@@ -389,7 +359,7 @@ class Reconstruction:
         self._state, self._lost_ns = TrackingState.LOST if pose is None else TrackingState.TRACKING, []
         self._last_posed_id = sight.frame.frame_id
         if pose is not None:
-            self._moves_to(sight.frame.frame_id, sight.frame.t_source_ns, pose.T_world_cam, grown.ids)
+            self._moves_to(sight.frame.frame_id, sight.frame.t_source_ns, pose.T_world_cam, ids)
         return self._result(sight.frame, newest, pose, is_keyframe=True, backfilled=backfilled)
 
     def _try_to_join(self, sight: Sight) -> float:
