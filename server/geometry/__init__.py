@@ -22,9 +22,9 @@ Points in images
     square_distance  squared distances, all with all
 
 Two views
-    two_view         relative pose from matches: searches, choice, refinement
-    two_view_candidates  what is searched for, and poses near pure turning and of a plane
-    two_view_refinement  the noise of a pair, and how much of the edges its errors have
+    two_view         relative pose from matches: the choice among candidates, which is then refined
+    two_view_candidates  poses that searches find, near pure turning, and of a plane
+    two_view_refinement  refinement, with the noise and the edges that a pair itself tells
     epipolar         residuals of a relative pose, cheirality, refinement
     agreement        how far each match moves like its neighbours
     lo_ransac        PoseLib's LO-RANSAC
