@@ -24,6 +24,7 @@ Frames and reconstructions
     trace_snr           the SNR of a link that follows a trace
     scene_suite         trajectories on drawn scenes
     runtime_child       one variant of ``runtime``, in its own process
+    speed_table         how long one image takes, for the README
 
 Calibration from images of the camera alone
     moving_images       what images of a moving camera tell of the camera

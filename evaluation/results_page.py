@@ -19,6 +19,7 @@ from semcast.evaluation.path_tables import WORST_RATIO, readme_table, trajectory
 from semcast.evaluation.pipeline import CLEAN
 from semcast.evaluation.plots import variant_name
 from semcast.evaluation.report import RESULTS, result_files
+from semcast.evaluation.speed_table import speed_table
 from semcast.evaluation.trace_snr import level_name
 from semcast.evaluation.trajectory_summary import trajectory_summary
 
@@ -444,6 +445,7 @@ if __name__ == "__main__":
     PAGE.write_text(results_page(), encoding="utf-8")
     for page, name, part in (
         (README, "results", readme_table(RESULTS)),
+        (README, "speed", speed_table(RESULTS)),
         *((CONFIDENCE_PAGE, name, make()) for name, make in CONFIDENCE_PARTS.items()),
     ):
         page.write_text(with_part(page.read_text(encoding="utf-8"), name, part), encoding="utf-8")

@@ -22,6 +22,7 @@ from semcast.common.trajectory import Trajectory
 from semcast.evaluation.markdown import with_part
 from semcast.evaluation.path_tables import readme_table
 from semcast.evaluation.results_page import CONFIDENCE_PARTS, RESULTS, results_page
+from semcast.evaluation.speed_table import speed_table
 from semcast.reference import reference, with_messages
 from semcast.server.frame_rows import FrameRow, summarise
 
@@ -115,6 +116,7 @@ def test_the_figures_in_the_docs_are_those_of_the_result_files(monkeypatch):
     assert (ROOT / "docs/results.md").read_text(encoding="utf-8") == results_page(), "run make results-page"
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     assert readme == with_part(readme, "results", readme_table(RESULTS)), "run make results-page"
+    assert readme == with_part(readme, "speed", speed_table(RESULTS)), "run make results-page"
     confidence = (ROOT / "docs/confidence.md").read_text(encoding="utf-8")
     for name, make in CONFIDENCE_PARTS.items():
         assert confidence == with_part(confidence, name, make()), "run make results-page"
