@@ -11,13 +11,13 @@ from dataclasses import fields
 from pathlib import Path
 
 import pytest
+from running_channel import running_channel
 
 from semcast.agent.play import PlaySettings
 from semcast.agent.settings import AgentSettings
 from semcast.agent.source_settings import SourceSettings
-from semcast.channel.emulator import run_channel, set_channel
+from semcast.channel.emulator import set_channel
 from semcast.channel.emulator_settings import EmulatorSettings
-from semcast.channel.settings import ChannelSettings
 from semcast.cli import main, verb_parser
 from semcast.commands.agent import settings_of
 from semcast.commands.evaluate import EVALUATIONS
@@ -25,8 +25,7 @@ from semcast.commands.running import read_given, read_settings, run_until_stoppe
 from semcast.common.argument_order import arguments_last
 from semcast.common.codec import DEFAULT_CODEC
 from semcast.common.config import to_toml
-from semcast.common.loopback import free_endpoint, open_hub
-from semcast.common.network_settings import NetworkSettings
+from semcast.common.loopback import free_endpoint
 from semcast.demo import DemoSettings
 from semcast.server.record import RecordSettings
 from semcast.server.replay import ReplaySettings
@@ -44,6 +43,13 @@ SETTINGS = {
     ("train",): TrainSettings,
     **{("eval", what): row[0] for what, row in EVALUATIONS.items()},
 }
+
+
+@pytest.fixture
+def channel():
+    """The endpoint of a running channel."""
+    with running_channel() as endpoint:
+        yield endpoint
 
 
 def parser_of(verb, *words):
@@ -132,24 +138,6 @@ def test_record_writes_run_mcap_unless_told_otherwise(tmp_path):
 def test_a_missing_setting_is_wrong_usage(words, missing, capsys):
     assert main(words) == 2
     assert capsys.readouterr().err == f"semcast {words[0]}: {missing} is required\n"
-
-
-@pytest.fixture
-def channel():
-    """The endpoint of a running channel with long bursts."""
-    hub, endpoint = open_hub()
-    stop = threading.Event()
-    link = ChannelSettings(burst_slots=20.0)
-    settings = EmulatorSettings(agent_id="a", link=link, network=NetworkSettings(connect=(endpoint,)))
-    thread = threading.Thread(target=run_channel, args=(settings, stop))
-    thread.start()
-    end_s = time.monotonic() + 15.0
-    while "channel" not in hub.alive_roles("a"):
-        assert time.monotonic() < end_s, "the channel did not start"
-    yield endpoint
-    stop.set()
-    thread.join(60)
-    hub.close()
 
 
 def test_set_is_checked_against_the_running_channel(channel, tmp_path, capsys):

@@ -6,39 +6,23 @@ import importlib.util
 import re
 import subprocess
 import sys
-import threading
-import time
 from pathlib import Path
 
 import pytest
+from running_channel import running_channel
 
-from semcast.channel.emulator import run_channel
-from semcast.channel.emulator_settings import EmulatorSettings
-from semcast.channel.settings import ChannelSettings
 from semcast.cli import main
 from semcast.commands.doctor import check_packages, check_processor, check_system, check_viewer
 from semcast.common.loopback import open_hub
 from semcast.common.metrics import Metrics
-from semcast.common.network_settings import NetworkSettings
 from semcast.common.status_beat import StatusBeat
 
 
 @pytest.fixture
 def channel():
-    """The endpoint of a running channel with long bursts."""
-    hub, endpoint = open_hub()
-    stop = threading.Event()
-    link = ChannelSettings(burst_slots=20.0)
-    settings = EmulatorSettings(agent_id="a", link=link, network=NetworkSettings(connect=(endpoint,)))
-    thread = threading.Thread(target=run_channel, args=(settings, stop))
-    thread.start()
-    end_s = time.monotonic() + 15.0
-    while "channel" not in hub.alive_roles("a"):
-        assert time.monotonic() < end_s, "the channel did not start"
-    yield endpoint
-    stop.set()
-    thread.join(60)
-    hub.close()
+    """The endpoint of a running channel."""
+    with running_channel() as endpoint:
+        yield endpoint
 
 
 def test_doctor_says_what_runs_an_agent_without_torch(monkeypatch):
