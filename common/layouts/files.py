@@ -23,6 +23,7 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tif
 _ENDINGS = "|".join(suffix[1:] for suffix in IMAGE_SUFFIXES)
 #: What follows the time in a line of a list of images, as far as the first end of an image's name.
 _IMAGE_NAME = re.compile(rf"[^\s,]+[\s,]+(.+?\.({_ENDINGS}))(?=[\s,]|$)", re.IGNORECASE)
+_DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+(e[+-]?\d+)?", re.IGNORECASE)
 _CALIBRATION_NAMES = ("intrinsics.json", "intrinsics.yaml", "camera.yaml", "calibration.yaml", "sensor.yaml")
 _TIMES_NAME = "times.txt"
 _TRUTH_NAME = "groundtruth.txt"
@@ -134,7 +135,18 @@ def finite_numbers(numbers: list[str], count: int) -> NDArray[np.float64]:
 
 
 def _read_times_ns(path: Path) -> NDArray[np.int64]:
-    return np.array(rows_of(path, 1, lambda row: seconds_to_ns(row.fields[0])), dtype=np.int64)
+    return np.array(rows_of(path, 1, _time_ns), dtype=np.int64)
+
+
+def _time_ns(row: TextRow) -> int:
+    """Return the time of a line that holds nothing else; a decimal comma would cut it to whole seconds.
+
+    Raises:
+        ValueError: It is no number of seconds.
+    """
+    if _DECIMAL_COMMA.fullmatch(row.line.strip()):
+        raise ValueError(f"time must have a decimal point, got {row.line.strip()!r}")
+    return seconds_to_ns(row.fields[0])
 
 
 def calibration_beside(folder: Path) -> Callable[[int, int], Intrinsics | None]:
