@@ -61,6 +61,7 @@ Reports, tables and pictures
     pair_summary        tables of frame pairs
     trajectory_summary  what confidence does to paths
     link_summary        the same by link, over all recordings
+    mode_summary        what of that is confidence itself
     depth_summary       what confidence does to depth maps
     plots               plots of results
     run_plots           plots of one run

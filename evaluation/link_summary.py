@@ -68,7 +68,7 @@ def compare_links(reports: Iterable[Report]) -> list[LinkComparison]:
             continue
         for snr_db, shared in paired_runs(report):
             of_link = found.setdefault((settings["link"]["channel"], snr_db), {})
-            of_link.setdefault(report["sequence"], []).append(_log_ratios(shared))
+            of_link.setdefault(report["sequence"], []).append(log_ratios(shared))
     compared = []
     for (channel, snr_db), of_link in sorted(found.items()):
         runs = [np.concatenate(logs) for logs in of_link.values()]
@@ -102,8 +102,8 @@ def _lines(links: Sequence[LinkComparison]) -> Iterator[str]:
     )
 
 
-def _log_ratios(shared: Sequence[tuple[Report, Report]]) -> Array:
-    """Logarithms ``(R, 4)`` of the ratios of ``FIGURES``, of runs that have all of them in both modes."""
+def log_ratios(shared: Sequence[tuple[Report, Report]]) -> Array:
+    """Return logarithms ``(R, 4)`` of the ratios of ``FIGURES``, of runs that have all of them in both."""
     both = np.array(
         [[[run.get(figure) for figure in FIGURES] for run in runs] for runs in shared], dtype=np.float64
     ).reshape(-1, 2, len(FIGURES))

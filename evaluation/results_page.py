@@ -14,6 +14,7 @@ from semcast.common.codec import DEFAULT_CODEC
 from semcast.evaluation.depth_summary import depth_summary
 from semcast.evaluation.link_summary import link_summary
 from semcast.evaluation.markdown import number, table, with_part
+from semcast.evaluation.mode_summary import mode_summary
 from semcast.evaluation.pair_summary import RIVAL, pair_headline, pair_summary
 from semcast.evaluation.path_tables import WORST_RATIO, readme_table, trajectory_table
 from semcast.evaluation.pipeline import CLEAN
@@ -436,6 +437,7 @@ CONFIDENCE_PARTS: dict[str, Callable[[], str]] = {
     "depth": lambda: depth_summary(next(_reports("depth_room.json"))),
     "trajectories": lambda: trajectory_summary(_reports("trajectory_*.json")),
     "links": lambda: link_summary(_reports("trajectory_*.json")),
+    "modes": lambda: mode_summary(_reports("trajectory_rayleigh_*_again_*.json")),
 }
 
 

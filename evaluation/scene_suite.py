@@ -6,7 +6,7 @@ Run by ``make bench-scenes``. Some hours of one core with the default three seed
 import argparse
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from semcast.channel.settings import ChannelSettings
@@ -30,7 +30,8 @@ _SEEDS = {
     "office": 110,
 }
 #: Other drawings of the same scenes, of which none was looked at before all were measured. Over the poor link
-#: alone: what confidence is worth there takes many recordings to tell.
+#: alone: what confidence is worth there takes many recordings to tell, and ``shuffled`` what of that is
+#: confidence itself.
 _SEEDS_AGAIN: dict[SceneName, int] = {
     "room": 3100,
     "flat": 3108,
@@ -100,7 +101,10 @@ def suite(folder: Path, results: Path, seeds: int) -> Iterator[Run]:
             if pace == "normal" or scene not in _NORMAL_ONLY_AGAIN:
                 out = folder / f"{scene}_again_{pace}"
                 render = RenderSettings(scene=scene, pace=pace, seed=seed, seconds=length_s, out=out)
-                yield _run(render, (_POOR_LINK_DB,), results, seeds)
+                run = _run(render, (_POOR_LINK_DB,), results, seeds)
+                json = results / f"trajectory_rayleigh_{out.name}_shuffled.json"
+                yield run
+                yield Run(render, replace(run.settings, confidence=("shuffled",), json=json))
 
 
 def _run(render: RenderSettings, links_db: tuple[float, ...], results: Path, seeds: int) -> Run:

@@ -53,7 +53,11 @@ class SequenceFiles:
 
 
 def check_times(path: Path, num_images: int, times_ns: NDArray[np.int64]) -> None:
-    """Refuse times that are not one for each image, or do not increase."""
+    """Check that times ``(N,)`` are one for each image, and increase.
+
+    Raises:
+        SourceError: They are not, or do not.
+    """
     if num_images != len(times_ns):
         raise SourceError(
             f"{path} must have one time per image, got {len(times_ns)} times and {num_images} images"
@@ -144,8 +148,8 @@ def _time_ns(row: TextRow) -> int:
     Raises:
         ValueError: It is no number of seconds.
     """
-    if _DECIMAL_COMMA.fullmatch(row.line.strip()):
-        raise ValueError(f"time must have a decimal point, got {row.line.strip()!r}")
+    if _DECIMAL_COMMA.fullmatch(text := row.line.split("#", 1)[0].strip()):
+        raise ValueError(f"time must have a decimal point, got {text!r}")
     return seconds_to_ns(row.fields[0])
 
 

@@ -89,7 +89,11 @@ def test_kitti_layout_moves_poses_to_the_camera_that_is_used(tmp_path, write_ima
     [
         ("0\n2\n1\n", "1 0 0 0 0 1 0 0 0 0 1 0", "must strictly increase, image 3 has 1 s after 2 s"),
         ("0\n1\n", "1 0 0 0 0 1 0 0 0 0 1 0", "one time per image, got 2 times and 3 images"),
-        ("0\n0,5\n1\n", "1 0 0 0 0 1 0 0 0 0 1 0", "times.txt:2: time must have a decimal point, got '0,5'"),
+        (
+            "0\n0,5 # half\n1\n",
+            "1 0 0 0 0 1 0 0 0 0 1 0",
+            "times.txt:2: time must have a decimal point, got '0,5'",
+        ),
         ("0\n1\n2\n", "nan 0 0 0 0 1 0 0 0 0 1 0", "poses.txt:1: must be 12 finite numbers, got nan 0"),
     ],
 )

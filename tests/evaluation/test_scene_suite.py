@@ -26,6 +26,8 @@ def test_suite_has_every_scene_at_two_paces_some_at_night_and_files_of_their_own
     assert len({run.render.seed for run in runs[: len(first)]}) == len(scene_suite.SCENE_SECONDS) + 2
     assert {name.replace("_again", "") for name in again} < set(by_day)
     assert {run.settings.snr_db for run in runs[len(first) :]} == {(2.0,)}
+    modes = {name: [run.settings.confidence for run in runs if run.render.out.name == name] for name in again}
+    assert all(found == [("robust", "off"), ("shuffled",)] for found in modes.values())
     seeds_again = {run.render.seed for run in runs[len(first) :]}
     assert seeds_again.isdisjoint(run.render.seed for run in runs[: len(first)])
     assert set(scene_suite.SCENE_SECONDS) == set(SCENES) - {"lorry"}
