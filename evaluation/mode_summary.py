@@ -24,13 +24,13 @@ def mode_summary(reports: Iterable[Report]) -> str:
     """Return the table as Markdown: geometric means over recordings, a mode over another, run by run.
 
     Args:
-        reports: Results of ``semcast eval trajectory`` over one link, each with some of the modes. At least
-            five recordings; those that lack a mode are left out.
+        reports: Results of ``semcast eval trajectory``, of which one SNR has all of the modes, in one file or
+            several. At least five recordings; what lacks a mode is left out.
     """
-    of_recording: dict[str, dict[str, dict[int, Report]]] = {}
+    of_recording: dict[tuple[str, float], dict[str, dict[int, Report]]] = {}
     for report in reports:
         for cell in report["cells"]:
-            modes = of_recording.setdefault(report["sequence"], {})
+            modes = of_recording.setdefault((report["sequence"], cell["snr_db"]), {})
             modes[cell["confidence"]] = {run["seed"]: run for run in cell["runs"]}
     wanted = set(chain(*_COMPARED))
     whole = [modes for modes in of_recording.values() if wanted <= modes.keys()]

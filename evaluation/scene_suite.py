@@ -30,8 +30,7 @@ _SEEDS = {
     "office": 110,
 }
 #: Other drawings of the same scenes, of which none was looked at before all were measured. Over the poor link
-#: alone: what confidence is worth there takes many recordings to tell, and ``shuffled`` what of that is
-#: confidence itself.
+#: alone: what confidence is worth there takes many recordings to tell.
 _SEEDS_AGAIN: dict[SceneName, int] = {
     "room": 3100,
     "flat": 3108,
@@ -85,7 +84,7 @@ def suite(folder: Path, results: Path, seeds: int) -> Iterator[Run]:
             out = folder / f"{scene}_{pace}"
             render = RenderSettings(scene=scene, pace=pace, seed=_SEEDS[scene], seconds=length_s, out=out)
             links_db = (_LINK_DB,) if scene == "block" else (_POOR_LINK_DB, _LINK_DB)
-            yield _run(render, links_db, results, seeds)
+            yield from _runs(render, links_db, results, seeds)
     for scene in NIGHTS:
         render = RenderSettings(
             scene=scene,
@@ -95,19 +94,17 @@ def suite(folder: Path, results: Path, seeds: int) -> Iterator[Run]:
             noise_sd=_NIGHT_NOISE_SD,
             out=folder / f"{scene}_night",
         )
-        yield _run(render, (_LINK_DB,), results, seeds)
+        yield from _runs(render, (_LINK_DB,), results, seeds)
     for scene, seed in _SEEDS_AGAIN.items():
         for pace, length_s in zip(_PACES, SCENE_SECONDS[scene], strict=True):
             if pace == "normal" or scene not in _NORMAL_ONLY_AGAIN:
                 out = folder / f"{scene}_again_{pace}"
                 render = RenderSettings(scene=scene, pace=pace, seed=seed, seconds=length_s, out=out)
-                run = _run(render, (_POOR_LINK_DB,), results, seeds)
-                json = results / f"trajectory_rayleigh_{out.name}_shuffled.json"
-                yield run
-                yield Run(render, replace(run.settings, confidence=("shuffled",), json=json))
+                yield from _runs(render, (_POOR_LINK_DB,), results, seeds)
 
 
-def _run(render: RenderSettings, links_db: tuple[float, ...], results: Path, seeds: int) -> Run:
+def _runs(render: RenderSettings, links_db: tuple[float, ...], results: Path, seeds: int) -> Iterator[Run]:
+    """Yield the run with confidence and without, and over the poor link what tells of confidence itself."""
     settings = TrajectorySettings(
         sequence=render.out,
         link=ChannelSettings(channel="rayleigh"),
@@ -118,7 +115,10 @@ def _run(render: RenderSettings, links_db: tuple[float, ...], results: Path, see
         rows=False,
         json=results / f"trajectory_rayleigh_{render.out.name}.json",
     )
-    return Run(render, settings)
+    yield Run(render, settings)
+    if _POOR_LINK_DB in links_db:
+        json = results / f"trajectory_rayleigh_{render.out.name}_shuffled.json"
+        yield Run(render, replace(settings, snr_db=(_POOR_LINK_DB,), confidence=("shuffled",), json=json))
 
 
 def main() -> None:
