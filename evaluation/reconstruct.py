@@ -14,13 +14,14 @@ from semcast.common.trajectory_error import ate, match_times
 from semcast.evaluation.live_poses import LivePose, live_figures
 from semcast.evaluation.pipeline import LinkedFrame
 from semcast.server.decoder import tracker_frame
-from semcast.server.frame_rows import FrameRow, summarise
+from semcast.server.frame_rows import FrameRow
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.bundle_problem import BundleProblem
 from semcast.server.mapping.reconstruction import Reconstruction
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import DecodedFrame, FrameResult, MapUpdate
 from semcast.server.run_results import results_of
+from semcast.server.run_summary import summarise
 from semcast.server.sent_frames import stretches
 
 #: Called after each processed frame; may add stages of its own to the row's ``stage_ms``.

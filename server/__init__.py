@@ -44,7 +44,8 @@ One stream
     reference         originals and true path, where they are known
 
 Results
-    frame_rows        one row per frame, and the summary made from them
+    frame_rows        one row per frame
+    run_summary       the figures of a run, made of its rows and its path
     run_results       trajectory, landmarks and files for exports
     image_writer      keeps decoded images
     outbox            publishes poses and map

@@ -23,7 +23,7 @@ from semcast.server.dense.cloud import DensePatch
 from semcast.server.export.outputs import EachFile, versions, write_json, write_ply
 from semcast.server.export.parts import after_gaps
 from semcast.server.former_run import set_aside
-from semcast.server.frame_rows import FrameRow, run_line, summarise, too_much
+from semcast.server.frame_rows import FrameRow
 from semcast.server.frame_views import frame_view
 from semcast.server.mapping.bundle_problem import BundleRunner
 from semcast.server.mapping.reconstruction import Reconstruction
@@ -31,6 +31,7 @@ from semcast.server.mapping.state import DecodedFrame, FrameResult, MapUpdate, T
 from semcast.server.metres import Metres
 from semcast.server.reference import Reference
 from semcast.server.run_results import Results, results_of, write_results
+from semcast.server.run_summary import run_line, summarise, too_much
 from semcast.server.sent_frames import stretches
 from semcast.server.session_cloud import SessionCloud
 from semcast.server.session_records import SessionRecords

@@ -35,8 +35,8 @@ from semcast.demo import (
 )
 from semcast.demo_recording import look_at
 from semcast.real_time import Plan
-from semcast.server.frame_rows import run_line, too_much
 from semcast.server.replay import ReplaySettings, replay
+from semcast.server.run_summary import run_line, too_much
 
 pytestmark = pytest.mark.xdist_group("real-time")
 

@@ -24,7 +24,8 @@ from semcast.evaluation.path_tables import readme_table
 from semcast.evaluation.results_page import CONFIDENCE_PARTS, RESULTS, results_page
 from semcast.evaluation.speed_table import speed_table
 from semcast.reference import reference, with_messages
-from semcast.server.frame_rows import FrameRow, summarise
+from semcast.server.frame_rows import FrameRow
+from semcast.server.run_summary import summarise
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])

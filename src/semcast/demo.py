@@ -32,8 +32,8 @@ from semcast.demo_recording import DemoRecording, look_at
 from semcast.demo_watch import ERROR_CODE, START_DEADLINE_S, Alive, watch
 from semcast.real_time import plan_for
 from semcast.server.former_run import check_not_foreign, discard, output_folder
-from semcast.server.frame_rows import run_line, too_much
 from semcast.server.mapping.settings import ReconstructionSettings
+from semcast.server.run_summary import run_line, too_much
 from semcast.server.settings import DenseWhen, SavedImages, ServerSettings
 from semcast.server.view.settings import ViewChoice, ViewSettings
 from semcast.server.viewing import check_viewer

@@ -1,4 +1,4 @@
-"""Rows survive a kill, and the summary says what happened."""
+"""Rows survive a kill and a full disk."""
 
 import json
 from dataclasses import replace
@@ -6,32 +6,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from full_disk import room_for
-from rows_of_runs import frame_row, straight_path
+from rows_of_runs import frame_row
 
 from semcast.common.errors import SemcastError
 from semcast.common.run_folder import FRAMES_NAME
 from semcast.server import frame_rows
-from semcast.server.export.outputs import write_json
-from semcast.server.frame_rows import FrameRow, FrameRows, read_rows, summarise
+from semcast.server.frame_rows import FrameRow, FrameRows, read_rows
 from semcast.server.mapping.state import DecodedFrame, FrameResult, TrackingState
-from semcast.server.sent_frames import stretches
-
-
-def row(frame_id, posed=True, **changes):
-    state, stage_ms = "tracking" if posed else "lost", {"decode": 20.0 + frame_id, "track": 10.0}
-    return frame_row(frame_id, **{"posed": posed, "state": state, "stage_ms": stage_ms, **changes})
-
-
-def summary_of(rows):
-    sent = stretches({r.frame_id: r.frame_id for r in rows})
-    part_of = {r.frame_id: 0 for r in rows}
-    return summarise(rows, straight_path(list(part_of)), part_of, None, sent, None, {}, 0)
 
 
 def test_rows_are_on_disk_at_once_and_a_torn_last_line_is_left_out(tmp_path):
     record = FrameRows(tmp_path)
-    record.add(row(0))
-    record.add(row(1, posed=False, psnr_db=float("nan")))
+    record.add(frame_row(0))
+    record.add(frame_row(1, posed=False, psnr_db=float("nan")))
     path = tmp_path / FRAMES_NAME
     assert [r.frame_id for r in read_rows(path)] == [0, 1]
     assert read_rows(path)[1].psnr_db is None
@@ -43,7 +30,7 @@ def test_rows_are_on_disk_at_once_and_a_torn_last_line_is_left_out(tmp_path):
 def test_a_resumed_run_goes_on_behind_its_rows_and_a_new_run_does_not(tmp_path):
     for k, resume, expected in ((0, False, [0]), (1, True, [0, 1]), (1, True, [0, 1]), (1, False, [1])):
         record = FrameRows(tmp_path, resume=resume)
-        record.add(row(k))
+        record.add(frame_row(k))
         record.close()
         record.close()
         assert [r.frame_id for r in record.rows()] == expected
@@ -57,7 +44,7 @@ def test_damage_in_the_middle_is_an_error_with_its_line(tmp_path):
 
 def test_rows_tell_the_part_of_the_map_and_older_rows_count_as_the_first(tmp_path):
     record = FrameRows(tmp_path)
-    record.add(row(0, submap=2))
+    record.add(frame_row(0, submap=2))
     record.close()
     path = tmp_path / FRAMES_NAME
     assert read_rows(path)[0].submap == 2
@@ -69,7 +56,7 @@ def test_rows_tell_the_part_of_the_map_and_older_rows_count_as_the_first(tmp_pat
 
 def test_without_a_folder_rows_stay_in_memory():
     record = FrameRows(None)
-    record.add(row(3))
+    record.add(frame_row(3))
     assert [r.frame_id for r in record.rows()] == [3]
 
 
@@ -84,19 +71,19 @@ def ids_in(folder):
 def test_rows_a_full_disk_did_not_take_are_written_when_it_has_room_again(tmp_path, caplog):
     now_s, told = 0.0, []
     record = FrameRows(tmp_path, on_error=told.append, clock=lambda: now_s)
-    record.add(row(0))
+    record.add(frame_row(0))
     with room_for(half_a_row_more(tmp_path)):
         for k in (1, 2, 3):
-            record.add(row(k))
+            record.add(frame_row(k))
             now_s += 2.0
     assert (tmp_path / FRAMES_NAME).read_bytes()[-1:] != b"\n", "a part of row 1 is there"
     assert [r.frame_id for r in record.rows()] == [0, 1, 2, 3]
     assert told == [f"{tmp_path / FRAMES_NAME} can't be written: [Errno 27] File too large"]
     assert caplog.text.count("File too large") == 1
-    record.add(row(4))
+    record.add(frame_row(4))
     assert ids_in(tmp_path) == [0, 1, 2, 3, 4]
     assert "is written again, with the rows that waited" in caplog.text
-    record.add(row(5))
+    record.add(frame_row(5))
     record.close()
     assert ids_in(tmp_path) == [r.frame_id for r in record.rows()] == [0, 1, 2, 3, 4, 5]
 
@@ -105,7 +92,7 @@ def test_rows_that_wait_at_the_end_are_written_then(tmp_path):
     record = FrameRows(tmp_path)
     with room_for(half_a_row_more(tmp_path)):
         for k in range(3):
-            record.add(row(k))
+            record.add(frame_row(k))
     record.finish()
     record.close()
     assert ids_in(tmp_path) == [0, 1, 2]
@@ -116,7 +103,7 @@ def test_rows_that_can_not_be_written_at_the_end_are_an_error(tmp_path, monkeypa
     record = FrameRows(tmp_path)
     with room_for(half_a_row_more(tmp_path)):
         for k in range(3):
-            record.add(row(k))
+            record.add(frame_row(k))
         with pytest.raises(OSError, match="File too large"):
             record.finish()
     with pytest.raises(OSError, match="1 rows are lost"):
@@ -128,7 +115,7 @@ def test_rows_that_can_not_be_written_at_the_end_are_an_error(tmp_path, monkeypa
 def test_a_damaged_line_does_not_keep_a_run_from_going_on(tmp_path, caplog):
     record = FrameRows(tmp_path)
     for k in range(5):
-        record.add(row(k))
+        record.add(frame_row(k))
     record.close()
     path = tmp_path / FRAMES_NAME
     lines = path.read_bytes().splitlines(keepends=True)
@@ -138,55 +125,9 @@ def test_a_damaged_line_does_not_keep_a_run_from_going_on(tmp_path, caplog):
         f"{path}: 2 lines are no frame rows and are left out: {path}:2 is not a frame row: "
         "Expecting value: line 1 column 1 (char 0)"
     ]
-    record.add(row(5))
+    record.add(frame_row(5))
     record.close()
     assert ids_in(tmp_path) == [0, 3, 4, 5]
-
-
-def test_the_summary_has_the_promised_keys_and_values(tmp_path):
-    rows = [row(k, posed=k != 3, psnr_db=30.0 + k) for k in range(10)]
-    rows.append(row(10, psnr_db=float("inf")))
-    kept = [k for k in range(11) if k != 3]
-    part_of = {k: 0 if k < 3 else 2 for k in kept}
-    sent = stretches({k: k for k in range(16)})
-    summary = summarise(
-        rows, straight_path(kept), part_of, straight_path(range(20)), sent, 20, {"superseded": 5}, 7
-    )
-    assert summary["ate_rmse_m"] == pytest.approx(0.0, abs=1e-9)
-    assert summary["completeness"] == 10 / 16
-    assert summary["psnr_db"] == pytest.approx(34.5)
-    assert summary["stage_ms"]["decode"]["p50"] == pytest.approx(25.0)
-    assert summary["stage_ms"]["decode"]["p95"] == pytest.approx(29.5)
-    assert summary["drops"] == {"superseded": 5}
-    assert summary["unposed_frames"] == [(3, 3), (11, 15)]
-    assert summary["parts"] == [{"submap": 0, "num_posed": 3}, {"submap": 2, "num_posed": 7}]
-    assert summary["frames"] == {"source": 20, "sent": 16, "tracked": 11, "posed": 10, "keyframes": 7}
-    assert summary["frame_rate_hz"] == pytest.approx(10 / 1.5), "of 1.5 s in which frames were sent"
-    assert summary["processed_rate_hz"] is None
-    assert {"ate_percent", "rpe_trans_percent", "rpe_rot_deg"} <= set(summary)
-    write_json(tmp_path / "summary.json", summary)
-    json.loads((tmp_path / "summary.json").read_text(), parse_constant=pytest.fail)
-
-
-def test_a_run_without_frames_has_a_summary_too():
-    summary = summarise([], straight_path([]), {}, None, [], None, {}, 0)
-    assert summary["parts"] == []
-    assert summary["completeness"] == 0.0
-    assert summary["ate_rmse_m"] is None
-    assert summary["psnr_db"] is None
-    assert summary["stage_ms"] == {}
-
-
-def test_a_recording_played_at_half_pace_is_processed_at_half_its_rate():
-    summary = summary_of([row(k, t_arrival_ns=7 + k * 200_000_000) for k in range(5)])
-    assert summary["frame_rate_hz"] == pytest.approx(10.0)
-    assert summary["processed_rate_hz"] == pytest.approx(5.0)
-
-
-def test_the_rate_by_arrival_survives_a_clock_that_began_anew():
-    times_ns = [9_000_000_000, 9_250_000_000, 10_000_000, 260_000_000]
-    summary = summary_of([row(k, t_arrival_ns=t) for k, t in enumerate(times_ns)])
-    assert summary["processed_rate_hz"] == pytest.approx(4.0)
 
 
 def test_the_row_of_a_tracked_frame_is_what_was_received_and_what_came_of_it():

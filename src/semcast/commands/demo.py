@@ -22,7 +22,7 @@ from semcast.common.run_folder import FRAMES_NAME, VIEWER_NAME, files_of_run
 from semcast.demo import DemoSettings, open_recording, run_demo
 from semcast.evaluation.report import STDOUT, provenance, write_result
 from semcast.server.export.parts import parts_line
-from semcast.server.frame_rows import too_much
+from semcast.server.run_summary import too_much
 
 
 def _measure(unit: str) -> Callable[[float], str]:
