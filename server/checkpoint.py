@@ -6,7 +6,7 @@ One uncompressed ``.npz`` (a zip of plain arrays with a CRC each, read without p
 import logging
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Self
 
@@ -38,6 +38,7 @@ class CheckpointHeader:
         frame_id: Newest frame in the map; frames up to it are not processed again.
         t_source_ns: Recorded time of that frame.
         map_epoch: Counts new maps within one run.
+        drops: Frames of the stream that were left out up to then, by reason.
     """
 
     agent_id: str
@@ -47,11 +48,12 @@ class CheckpointHeader:
     frame_id: int
     t_source_ns: int
     map_epoch: int
+    drops: dict[str, int] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, identity: StreamIdentity, frame_id: int, t_source_ns: int, map_epoch: int) -> Self:
-        """Return the header of a map of a stream."""
-        return cls(**_owner(identity), frame_id=frame_id, t_source_ns=t_source_ns, map_epoch=map_epoch)
+    def of(cls, identity: StreamIdentity, **rest: Any) -> Self:
+        """Return the header of a map of a stream; ``rest`` is what the stream's identity does not tell."""
+        return cls(**_owner(identity), **rest)
 
 
 def _owner(identity: StreamIdentity) -> dict[str, Any]:
@@ -108,6 +110,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
         raise CheckpointError(f"{path} is a checkpoint of another version of semcast")
     try:
         header["camera"] = Intrinsics.from_dict(header["camera"])
+        header["drops"] = {str(reason): int(num) for reason, num in header.get("drops", {}).items()}
         maps = {name.removeprefix(_MAP): array for name, array in arrays.items() if name.startswith(_MAP)}
         return Checkpoint(CheckpointHeader(**header), maps)
     except Exception as err:  # what is in place of a field fails in many ways

@@ -107,6 +107,7 @@ class Session:
         self._told = ""
         self._last_checkpoint_s = time.monotonic()
         self.resumed = False
+        self.former_drops: Mapping[str, int] = {}
         self._records = self._recorded_in(None)
         if folder is not None:
             try:
@@ -155,6 +156,7 @@ class Session:
             logger.warning("a new map is started, the checkpoint can't be used: %s", err)
             self.restart_map()
             return False
+        self.former_drops = checkpoint.header.drops
         self._last_frame_id = checkpoint.header.frame_id
         self._map_epoch = checkpoint.header.map_epoch
         self._state = TrackingState.LOST
@@ -238,7 +240,7 @@ class Session:
         self._records.keep_image(frame, result, update)
         self._map_epoch = result.map_epoch
         if time.monotonic() - self._last_checkpoint_s >= self._settings.checkpoint_interval_s:
-            self.save_checkpoint()
+            self.save_checkpoint(arrival.drops)
         view = frame_view(frame, result, row, arrival.drops)
         if self._restored:
             restored = [(k, self._t_source_ns.get(k, 0), T) for k, T in sorted(self._restored.items())]
@@ -274,13 +276,23 @@ class Session:
             quality.cancel()
             return None
 
-    def save_checkpoint(self) -> None:
-        """Hand the map to the checkpoint writer; a no-op without a folder or before the first frame."""
+    def save_checkpoint(self, drops: Mapping[str, int]) -> None:
+        """Hand the map to the checkpoint writer; a no-op without a folder or before the first frame.
+
+        Args:
+            drops: Frames of the stream that were dropped up to now, by reason.
+        """
         self._last_checkpoint_s = time.monotonic()
         if not self._records.takes_checkpoints or self._last_frame_id < 0:
             return
         t_source_ns = self._t_source_ns.get(self._last_frame_id, 0)
-        header = CheckpointHeader.of(self.identity, self._last_frame_id, t_source_ns, self._map_epoch)
+        header = CheckpointHeader.of(
+            self.identity,
+            frame_id=self._last_frame_id,
+            t_source_ns=t_source_ns,
+            map_epoch=self._map_epoch,
+            drops=dict(drops),
+        )
         arrays = {**self._reconstruction.snapshot(), **self.metres.arrays()}
         self._records.write_checkpoint(Checkpoint(header, arrays))
 

@@ -105,7 +105,10 @@ class SuccessiveSessions:
             self._reference = self._new_reference(identity, goes_on=goes_on)
         self.current = self._new_session(identity, goes_on=goes_on)
         self._former_starts.begin(identity.agent_epoch)
+        #: In the counts of the process but not of the stream; less those of its run that this one resumes.
         self._drops_before = self._metrics.drops if former is not None else {}
+        for reason, num in self.current.former_drops.items():
+            self._drops_before[reason] = self._drops_before.get(reason, 0) - num
         self._show(identity, self.current.resumed, goes_on=goes_on)
         logger.info(
             "stream of %s (%s): %dx%d, codec %s, %s mode",
@@ -115,8 +118,8 @@ class SuccessiveSessions:
 
     def drops(self) -> dict[str, int]:
         """Return frames dropped since the present stream began, by reason: 0 where all were before it."""
-        now = self._metrics.drops
-        return {reason: max(0, now[reason] - self._drops_before.get(reason, 0)) for reason in now}
+        now, before = self._metrics.drops, self._drops_before
+        return {reason: max(0, now.get(reason, 0) - before.get(reason, 0)) for reason in {**before, **now}}
 
     def _new_reference(self, identity: StreamIdentity, *, goes_on: bool) -> Reference | None:
         """Return the reference for a camera; a server that ``goes_on`` does without one if need be."""
@@ -170,7 +173,7 @@ class SuccessiveSessions:
         return "" if self.current is None else self._save(self.current)
 
     def _save(self, session: Session) -> str:
-        session.save_checkpoint()
+        session.save_checkpoint(self.drops())
         try:
             session.write_results(self._settings.out)
         except (OSError, SemcastError) as err:
@@ -264,7 +267,7 @@ class SuccessiveSessions:
     def _write(self, session: Session, folder: Path | None) -> dict[str, Any]:
         complete, num_sent = self._end_of.complete, self._end_of.num_sent(session.identity.agent_epoch)
         if not complete:
-            session.save_checkpoint()
+            session.save_checkpoint(self.drops())
         drops = {reason: count for reason, count in self.drops().items() if count}
         return session.write_outputs(folder, drops, complete=complete, num_sent=num_sent)
 

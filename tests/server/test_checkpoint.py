@@ -1,6 +1,7 @@
 """Checkpoints are whole or refused."""
 
 import os
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -8,7 +9,9 @@ from waiting import until
 
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import CheckpointError
+from semcast.common.npz_file import write_npz
 from semcast.server.checkpoint import (
+    FORMAT,
     Checkpoint,
     CheckpointHeader,
     CheckpointWriter,
@@ -29,6 +32,7 @@ def checkpoint(frame_id=7):
         frame_id=frame_id,
         t_source_ns=700_000_000,
         map_epoch=2,
+        drops={"superseded": 3, "missing": 1},
     )
     rng = np.random.default_rng(frame_id)
     arrays = {
@@ -160,3 +164,15 @@ def test_the_writer_survives_what_nobody_expected(tmp_path, monkeypatch, caplog)
     assert (writer.num_failed, writer.num_written) == (1, 1)
     assert load_checkpoint(path).header.frame_id == 2
     assert "MemoryError; the stream goes on, and the next checkpoint is tried" in caplog.text
+
+
+@pytest.mark.parametrize("drops", [3, {"superseded": "many"}])
+def test_drops_that_are_no_counts_are_damage_and_older_files_have_none(tmp_path, drops):
+    path = tmp_path / "map.npz"
+    header = {"format": FORMAT, **asdict(checkpoint().header), "camera": CAMERA.to_dict(), "drops": drops}
+    write_npz(path, header, {}, compressed=False, durable=False)
+    with pytest.raises(CheckpointError, match=r"map.npz can't be read as a checkpoint"):
+        load_checkpoint(path)
+    del header["drops"]
+    write_npz(path, header, {}, compressed=False, durable=False)
+    assert load_checkpoint(path).header.drops == {}

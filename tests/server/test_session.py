@@ -161,7 +161,7 @@ def test_an_adjustment_that_can_not_be_applied_between_two_frames_does_not_end_t
 @pytest.mark.parametrize(("interval_s", "saved"), [(3600.0, 0), (0.1, 1)])
 def test_the_map_is_kept_as_often_as_is_said(process, monkeypatch, interval_s, saved):
     seen = []
-    monkeypatch.setattr(Session, "save_checkpoint", lambda session: seen.append(session))
+    monkeypatch.setattr(Session, "save_checkpoint", lambda session, drops: seen.append(session))
     one = process(Reference(lambda frame_id: IMAGE), checkpoint_interval_s=interval_s)
     threading.Event().wait(0.11)
     one(0)

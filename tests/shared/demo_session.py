@@ -41,7 +41,7 @@ def run_session(demo, folder, frame_ids, epoch=5, program=None, **settings):
         session.process(frame, Arrival(None, None, now_ns, now_ns, {}, {}))
     try:
         if killed:
-            session.save_checkpoint()
+            session.save_checkpoint({})
         else:
             session.conclude()
             list(session.complete_cloud())

@@ -214,6 +214,30 @@ def test_a_restarted_server_goes_on_with_the_map_of_its_checkpoint(tmp_path, ope
         assert np.linalg.norm(centre(after[k]) - centre(before[30 - k])) < 0.5 * step
 
 
+def test_frames_dropped_before_a_restart_are_in_the_summary_of_the_run(tmp_path, open_air):
+    def stream_but_one(air, ids):
+        radio = air.agent(100)
+        for k in ids:
+            if k == ids[len(ids) // 2]:
+                radio.send(k, digest="0" * 16)
+                running.wait_for_drop("codec")
+            else:
+                radio.stream([k])
+
+    with open_air() as air:
+        running = air.serve(out=tmp_path, checkpoint_interval_s=3600.0)
+        stream_but_one(air, range(7))
+        assert running.finish(stop=True)["drops"] == {"codec": 1}
+    for num_before, ids in ((1, range(7, 12)), (2, range(12, 24))):
+        with open_air() as air:
+            running = air.serve(out=tmp_path, checkpoint_interval_s=3600.0)
+            stream_but_one(air, ids)
+            summary = running.finish(stop=ids.stop < 24)
+        assert summary["resumed"]
+        assert summary["drops"] == {"codec": num_before + 1}
+    assert summary["frames"]["tracked"] == 21
+
+
 def test_a_lossless_server_that_is_stopped_on_the_way_and_started_again_loses_no_frame(tmp_path, open_air):
     with open_air() as air:
         running = air.serve(mode="replay", out=tmp_path)
