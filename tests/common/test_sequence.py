@@ -1,5 +1,6 @@
 import json
 import os
+import shutil
 
 import cv2
 import numpy as np
@@ -310,6 +311,25 @@ def damage_number(folder):
 def test_what_is_wrong_with_a_recording_is_said(native, damage, message):
     with pytest.raises(SourceError, match=message):
         open_sequence(damage(native))
+
+
+def test_a_folder_above_sequences_says_where_they_are(native):
+    root = native.parent / "set"
+    (root / "sequences").mkdir(parents=True)
+    native = native.rename(root / "sequences" / "06")
+    with pytest.raises(SourceError, match=f"no sequence at {root} itself, but at {native}$"):
+        open_sequence(root)
+    shutil.copytree(native, native.with_name("07"))
+    with pytest.raises(SourceError, match=f"but at {native} and 1 more$"):
+        open_sequence(root)
+
+
+@pytest.mark.parametrize(("gap", "is_asked"), [(5, False), (100, True)])
+def test_times_that_are_hardly_seconds_are_asked_about(native, gap, is_asked, caplog):
+    (native / "times.txt").write_text("".join(f"{gap * k}\n" for k in range(5)))
+    (native / "groundtruth.txt").unlink()
+    open_sequence(native)
+    assert (f"images of {native} are 100 s apart: are these times in seconds?" in caplog.text) == is_asked
 
 
 def test_images_of_which_each_looks_elsewhere_are_no_stream(native, poses):
